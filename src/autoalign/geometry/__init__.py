@@ -1,0 +1,1 @@
+"""Points and 3x3 transforms in pure NumPy; knows no pixels."""

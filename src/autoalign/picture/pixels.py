@@ -1,0 +1,90 @@
+"""What a picture is, its grey version, and its area-shrunken version with the exact coordinate map back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Picture = NDArray[Any]
+"""Pixels (h, w) or (h, w, c) with c in 1..4: grey, grey + alpha, RGB, RGB + alpha; uint8, uint16 or float32."""
+
+DTYPES = (np.uint8, np.uint16, np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shrunken:
+    """A picture made smaller, and the transform that takes its pixels to those of the full one."""
+
+    pixels: NDArray[np.uint8]
+    full_from_small: NDArray[np.float64]  # (3, 3)
+
+
+def check_picture(image: Picture, name: str = "picture") -> None:
+    """Raise ValueError unless `image` is a picture as `Picture` says."""
+    if not isinstance(image, np.ndarray) or image.dtype not in DTYPES:
+        raise ValueError(f"{name} must be a uint8, uint16 or float32 array, not {getattr(image, 'dtype', type(image))}")
+    if image.ndim not in (2, 3) or (image.ndim == 3 and not 1 <= image.shape[2] <= 4):
+        raise ValueError(f"{name} must have shape (h, w) or (h, w, 1..4), not {image.shape}")
+    if 0 in image.shape:
+        raise ValueError(f"{name} has no pixels: shape {image.shape}")
+
+
+def size_of(image: Picture) -> tuple[int, int]:
+    """(w, h) of a picture."""
+    return image.shape[1], image.shape[0]
+
+
+def has_alpha(image: Picture) -> bool:
+    """True if the last channel is an opacity."""
+    return image.ndim == 3 and image.shape[2] in (2, 4)
+
+
+def opaque(image: Picture) -> NDArray[np.bool_] | None:
+    """(h, w) True where an alpha channel is not zero; None for a picture without one."""
+    return image[..., -1] > 0 if has_alpha(image) else None
+
+
+def grey(image: Picture) -> Picture:
+    """(h, w) luminance (ITU-R BT.601) in the picture's own dtype; alpha is dropped."""
+    if image.ndim == 2:
+        return image
+    if image.shape[2] < 3:
+        return np.ascontiguousarray(image[..., 0])
+    code = cv2.COLOR_RGBA2GRAY if image.shape[2] == 4 else cv2.COLOR_RGB2GRAY
+    return np.asarray(cv2.cvtColor(image, code))
+
+
+def to_8_bit(image: Picture) -> NDArray[np.uint8]:
+    """(h, w) grey as uint8: 8-bit as it is, others stretched between their 0.1 and 99.9 percentiles.
+
+    Values that are not finite count as the darkest.
+    """
+    if image.dtype == np.uint8:
+        return image
+    values = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    low, high = np.percentile(values, (0.1, 99.9))
+    stretched = (values - low) * (255.0 / max(float(high - low), 1e-12))
+    return np.asarray(np.clip(np.rint(stretched), 0, 255).astype(np.uint8))
+
+
+def resize_map(full_size: tuple[int, int], small_size: tuple[int, int]) -> NDArray[np.float64]:
+    """(3, 3) `full_from_small` of a resize between two sizes (w, h).
+
+    `cv2.resize` aligns the edges of the pictures, not the centres of their corner pixels, which puts half a pixel on
+    either side: x_full = (x_small + 0.5) * W / w - 0.5.
+    """
+    sx, sy = full_size[0] / small_size[0], full_size[1] / small_size[1]
+    return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
+
+
+def shrink(image: NDArray[np.uint8], max_pixels: float) -> Shrunken:
+    """Shrink by area to at most `max_pixels`; a smaller picture comes back as it is."""
+    w, h = size_of(image)
+    scale = min(1.0, (max_pixels / (w * h)) ** 0.5)
+    small_size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    pixels = image if small_size == (w, h) else cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
+    return Shrunken(pixels=np.asarray(pixels), full_from_small=resize_map((w, h), small_size))
