@@ -1,0 +1,166 @@
+"""Robust Levenberg-Marquardt on the symmetric transfer error, for any model of the family.
+
+The transform moves along the generators of its model, H <- H exp(sum a_i G_i), so that it never leaves the model, needs
+no gauge and gives its inverse for swapped pictures. A generator is a velocity field V(p) over the src plane: the
+projected src moves by J_H V(src), and dst taken back moves by -V there, which is all the derivative there is.
+
+Source: Hartley and Zisserman, 4.3 and appendix 6; iteratively reweighted with Tukey's biweight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from autoalign.geometry.family import Model
+from autoalign.geometry.homography import Array, invert, jacobian, normalisation, project, unit
+
+TUKEY = 4.685  # 95 % efficiency at a normal distribution
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correspondences:
+    """Pairs of points, and how far each may be off."""
+
+    src: Array  # (n, 2)
+    dst: Array  # (n, 2)
+    src_sigma: Array  # (n,) expected error of a point, px of its picture
+    dst_sigma: Array  # (n,)
+
+    def __len__(self) -> int:
+        return len(self.src)
+
+    def __getitem__(self, index: object) -> Correspondences:
+        """The pairs chosen by a mask or by indices."""
+        chosen = np.asarray(index)
+        return Correspondences(
+            src=self.src[chosen],
+            dst=self.dst[chosen],
+            src_sigma=self.src_sigma[chosen],
+            dst_sigma=self.dst_sigma[chosen],
+        )
+
+
+def correspondences(src: Array, dst: Array, src_sigma: float = 1.0, dst_sigma: float = 1.0) -> Correspondences:
+    """Pairs that are all equally good."""
+    n = len(src)
+    return Correspondences(src=src, dst=dst, src_sigma=np.full(n, src_sigma), dst_sigma=np.full(n, dst_sigma))
+
+
+def velocities(model: Model, points: Array, norm: Array) -> Array:
+    """(n, 2, dof) velocity of points (n, 2) under each generator, taken in coordinates normalised by `norm` (3, 3).
+
+    The normalisation is a similarity, which maps every model of the family onto itself; it only conditions the numbers.
+    """
+    scale = norm[0, 0]
+    u = points * scale + norm[:2, 2]
+    homogeneous = np.concatenate([u, np.ones((len(u), 1))], axis=1)
+    moved = np.einsum("gij,nj->nig", model.generators, homogeneous)
+    return np.asarray((moved[:, :2] - u[:, :, None] * moved[:, 2:]) / scale)
+
+
+def step(model: Model, transform: Array, parameters: Array, norm: Array) -> Array:
+    """H exp(sum a_i G_i) of unit norm, the generators taken in the normalised frame."""
+    generator = np.einsum("g,gij->ij", parameters, model.generators)
+    size = np.abs(generator).max()
+    halvings = max(0, int(np.ceil(np.log2(max(size, 1e-300) / 0.1))))
+    scaled = generator / 2**halvings
+    exponential, term = np.eye(3), np.eye(3)
+    for k in range(1, 12):  # 0.3**12 / 12! is far under the rounding of a double
+        term = term @ scaled / k
+        exponential = exponential + term
+    for _ in range(halvings):
+        exponential = exponential @ exponential
+    inverse_norm = np.linalg.inv(norm)
+    return unit(transform @ inverse_norm @ exponential @ norm)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Linearised:
+    forward: Array  # (n, 2) residuals in sigmas
+    backward: Array  # (n, 2)
+    forward_slope: Array  # (n, 2, dof) of the projected src, in sigmas
+    backward_slope: Array  # (n, 2, dof)
+
+    @property
+    def error_squared(self) -> Array:
+        return 0.5 * ((self.forward**2).sum(1) + (self.backward**2).sum(1))
+
+
+def _residuals(transform: Array, pairs: Correspondences) -> tuple[Array, Array, Array]:
+    """Forward and backward residuals (n, 2) in sigmas, and dst taken back to the src plane (n, 2)."""
+    projected, _ = project(transform, pairs.src)
+    back, _ = project(invert(transform), pairs.dst)
+    return (pairs.dst - projected) / pairs.dst_sigma[:, None], (pairs.src - back) / pairs.src_sigma[:, None], back
+
+
+def _linearise(model: Model, transform: Array, pairs: Correspondences, norm: Array) -> _Linearised:
+    forward, backward, back = _residuals(transform, pairs)
+    forward_slope = np.einsum("nij,njg->nig", jacobian(transform, pairs.src), velocities(model, pairs.src, norm))
+    return _Linearised(
+        forward=forward,
+        backward=backward,
+        forward_slope=forward_slope / pairs.dst_sigma[:, None, None],
+        backward_slope=-velocities(model, back, norm) / pairs.src_sigma[:, None, None],
+    )
+
+
+def robust_scale(error_squared: Array, floor: float) -> float:
+    """Sigma of a coordinate from the median of squared 2-D errors (Rayleigh: median = 1.1774 sigma), never under `floor`."""
+    return max(float(np.sqrt(np.median(error_squared))) / 1.1774, floor)
+
+
+def tukey_weights(error_squared: Array, sigma: float) -> Array:
+    """(n,) Tukey biweights of squared 2-D errors."""
+    ratio = np.minimum(error_squared / (TUKEY * sigma) ** 2, 1.0)
+    return np.asarray((1.0 - ratio) ** 2)
+
+
+def _tukey_cost(error_squared: Array, sigma: float) -> float:
+    return float((1.0 - (1.0 - np.minimum(error_squared / (TUKEY * sigma) ** 2, 1.0)) ** 3).sum())
+
+
+def _normal_equations(at: _Linearised, weights: Array) -> tuple[Array, Array]:
+    """(dof, dof) and (dof,): einsum without BLAS, so that the bits do not depend on the number of threads."""
+    slope = np.concatenate([at.forward_slope, at.backward_slope], axis=1)
+    residual = np.concatenate([at.forward, at.backward], axis=1)
+    weighted = slope * weights[:, None, None]
+    return np.einsum("nri,nrj->ij", weighted, slope), np.einsum("nri,nr->i", weighted, residual)
+
+
+def polish(
+    model: Model, transform: Array, pairs: Correspondences, *, sigma_floor: float = 0.1, max_steps: int = 30
+) -> Array:
+    """The transform of the model that minimises Tukey's biweight of the symmetric transfer error, from a near one.
+
+    `pairs` are the inliers of a consensus, at least as many as fix the model; the scale of the biweight is re-estimated
+    as the fit improves, and never below `sigma_floor` sigmas. Returns (3, 3) of unit norm; `transform` itself where no
+    step improves it.
+    """
+    norm = normalisation(pairs.src)
+    damping = 1e-3
+    at = _linearise(model, transform, pairs, norm)
+    for _ in range(max_steps):
+        error = at.error_squared
+        if not np.isfinite(error).all():
+            return transform
+        sigma = robust_scale(error, sigma_floor)
+        cost = _tukey_cost(error, sigma)
+        normal, right = _normal_equations(at, tukey_weights(error, sigma))
+        normal[np.diag_indices_from(normal)] *= 1.0 + damping
+        try:
+            parameters = np.linalg.solve(normal, right)
+        except np.linalg.LinAlgError:
+            return transform
+        candidate = step(model, transform, parameters, norm)
+        then = _linearise(model, candidate, pairs, norm)
+        if _tukey_cost(then.error_squared, sigma) > cost or not np.isfinite(then.error_squared).all():
+            damping *= 10.0
+            if damping > 1e6:
+                return transform
+            continue
+        transform, at, damping = candidate, then, max(damping * 0.1, 1e-9)
+        if np.abs(parameters).max() < 1e-9:
+            return transform
+    return transform
