@@ -162,16 +162,14 @@ def four_point(src: Array, dst: Array, min_area: float = 1e-9) -> tuple[Array, M
     src_n, dst_n = _affine_apply(src_norm, src), _affine_apply(dst_norm, dst)
     m_src, m_dst = _triple_areas(src_n), _triple_areas(dst_n)
     flat = (np.abs(m_src) < min_area).any(-1) | (np.abs(m_dst) < min_area).any(-1)
-    same_side = (np.sign(m_src[..., 1:]) * np.sign(m_src[..., :1]) == np.sign(m_dst[..., 1:]) * np.sign(m_dst[..., :1])).all(-1)
-    homogeneous_src, homogeneous_dst = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (src_n, dst_n))
+    side_src, side_dst = (np.sign(m[..., 1:] * m[..., :1]) for m in (m_src, m_dst))
+    same_side = (side_src == side_dst).all(-1)
+    src_h, dst_h = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (src_n, dst_n))
     # diag(m_dst / m_src) without a division, and with w > 0 at the points: times the other two weights of src.
     weight = m_dst[..., 1:] * m_src[..., (2, 3, 1)] * m_src[..., (3, 1, 2)]
-    weight = weight * np.sign(m_dst[..., :1] * m_src[..., :1] * m_src[..., 1:].prod(-1, keepdims=True) * m_src[..., :1])
-    rows = np.stack(
-        [np.cross(homogeneous_src[..., (i + 1) % 3, :], homogeneous_src[..., (i + 2) % 3, :]) for i in range(3)], axis=-2
-    )
-    rows = rows * np.sign(m_src[..., :1])[..., None]
-    normalised = np.einsum("...i,...ia,...ib->...ab", weight, homogeneous_dst[..., :3, :], rows)
+    weight = weight * np.sign(m_dst[..., :1] * m_src[..., 1:].prod(-1, keepdims=True))
+    rows = np.stack([np.cross(src_h[..., (i + 1) % 3, :], src_h[..., (i + 2) % 3, :]) for i in range(3)], axis=-2)
+    normalised = np.einsum("...i,...ia,...ib->...ab", weight, dst_h[..., :3, :], rows)
     sound = ~flat & same_side
     normalised[~sound] = IDENTITY
     denormalised = _undo_normalisation(normalised, src_norm, dst_norm)
