@@ -1,0 +1,90 @@
+"""The formats that Pillow reads and writes for us: WebP, BMP, and AVIF to read only.
+
+The classes of the formats are called directly, not through `PIL.Image.open`: they read the header alone, and neither
+warn nor refuse by a limit that is global to the process. The size is checked by our own limit.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+import numpy as np
+from PIL import Image
+from PIL.ImageFile import ImageFile
+
+from autoalign.files.codec import Decoder, Encoder, Header, Refused
+from autoalign.files.metadata import Metadata, exif_orientation, resolution, without_prefix
+from autoalign.picture.pixels import Picture
+
+MODES = {"1": "L", "P": "RGB"}  # how Pillow is to hand over what is no picture of ours
+
+
+def webp_decoder() -> Decoder:
+    """RGB, with or without alpha, uint8; the first picture of an animation."""
+    from PIL.WebPImagePlugin import WebPImageFile
+
+    return _decoder(WebPImageFile)
+
+
+def bmp_decoder() -> Decoder:
+    """Grey or RGB, with or without alpha, uint8; palettes are resolved."""
+    from PIL.BmpImagePlugin import BmpImageFile
+
+    return _decoder(BmpImageFile)
+
+
+def avif_decoder() -> Decoder:
+    """Grey or RGB, with or without alpha, uint8 (10 and 12 bits are reduced by Pillow); the first of a sequence."""
+    from PIL.AvifImagePlugin import AvifImageFile
+
+    return _decoder(AvifImageFile)
+
+
+def webp_encoder() -> Encoder:
+    """Lossless: grey (which becomes RGB, WebP knows no other) or RGB, uint8, with or without alpha."""
+
+    def encode(pixels: Picture, metadata: Metadata) -> bytes:
+        blocks = {"icc_profile": metadata.icc, "exif": metadata.exif, "xmp": metadata.xmp}
+        present = {name: block for name, block in blocks.items() if block}
+        # Exact: the colour under full transparency stays too.
+        return _saved(pixels, "WEBP", lossless=True, exact=True, **present)
+
+    return encode
+
+
+def bmp_encoder() -> Encoder:
+    """Grey or RGB, uint8."""
+
+    def encode(pixels: Picture, metadata: Metadata) -> bytes:
+        return _saved(pixels, "BMP", dpi=metadata.dpi or (0, 0))
+
+    return encode
+
+
+def _decoder(opened: Callable[[io.BytesIO], ImageFile]) -> Decoder:
+    def read_header(data: bytes) -> Header:
+        try:
+            image = opened(io.BytesIO(data))
+        except Image.DecompressionBombError:  # of WebP, whose reader allocates on opening
+            raise Refused("is larger than the 178 megapixels that are read of this format") from None
+        info = image.info
+        metadata = Metadata(
+            icc=info.get("icc_profile") or None,
+            exif=without_prefix(info.get("exif")),
+            xmp=info.get("xmp") or None,
+            dpi=resolution(*info.get("dpi", (0, 0))),
+        )
+        return Header(size=image.size, orientation=exif_orientation(metadata.exif), metadata=metadata)
+
+    def decode(data: bytes) -> Picture:
+        image = opened(io.BytesIO(data))
+        return np.array(image.convert(MODES.get(image.mode, image.mode)))
+
+    return Decoder(read_header=read_header, decode=decode)
+
+
+def _saved(pixels: Picture, name: str, **options: object) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, name, **options)
+    return stream.getvalue()

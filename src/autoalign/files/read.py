@@ -1,0 +1,134 @@
+"""A file to a picture: bytes read here, size checked before anything is decoded, then one strict decoder.
+
+The extension is not believed, the first bytes are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from autoalign.errors import ImageReadError
+from autoalign.files.codec import Header, Refused, one_line
+from autoalign.files.formats import HEAD_BYTES, Format, decoder_for, of_bytes
+from autoalign.files.metadata import Metadata, describing, turned
+from autoalign.picture.pixels import Picture, size_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedPicture:
+    """A picture as it is to be seen, and what came with it."""
+
+    pixels: Picture  # (h, w) or (h, w, c): grey or RGB, with or without alpha; upright
+    metadata: Metadata  # true for these pixels: orientation 1
+    sha256: str  # of the file's bytes, 64 hexadecimal digits
+    format: str  # "JPEG", "PNG", ...: what the bytes are, whatever the extension says
+    path: Path
+
+
+def read_picture(path: str | Path, *, max_pixels: float = 300e6, page: int = 0) -> LoadedPicture:
+    """Read a picture: JPEG, PNG, TIFF, WebP, BMP or AVIF; uint8, uint16 or float32 as the file has it.
+
+    The EXIF orientation is applied to the pixels. `page`, from 0, selects one of a TIFF. Raises ImageReadError, one
+    line with the path last, if there is no such file, it is no picture, more than `max_pixels` pixels large (found
+    from the header, before anything is decoded), damaged, or of a kind that autoalign does not take.
+    """
+    path = Path(path)
+    with _opened(path) as file:
+        format = _format(file.read(HEAD_BYTES), path)
+        file.seek(0)
+        data = file.read()
+    header, pixels = _decoded(data, format, page, max_pixels, path)
+    return LoadedPicture(
+        pixels=pixels,
+        metadata=describing(turned(header.metadata, header.orientation), pixels),
+        sha256=hashlib.sha256(data).hexdigest(),
+        format=format.name,
+        path=path,
+    )
+
+
+def read_text(path: Path, *, max_bytes: int) -> str:
+    """A small UTF-8 file as text, with or without a byte order mark; line ends become newlines.
+
+    Raises ImageReadError if it cannot be read, is larger than `max_bytes` or no UTF-8.
+    """
+    with _opened(path) as file:
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise ImageReadError(f"is larger than the {max_bytes:,} bytes allowed: {path}")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ImageReadError(f"is not UTF-8 text: {path}") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def upright(pixels: Picture, orientation: int) -> Picture:
+    """Pixels (h, w) or (h, w, c) turned as the EXIF orientation, 1 to 8, asks; 5 to 8 swap height and width."""
+    if orientation >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    # What is left is to turn rows and columns round; after the swap, 6 is a quarter turn clockwise, 8 the other way.
+    rows_reversed = orientation in (3, 4, 7, 8)
+    columns_reversed = orientation in (2, 3, 6, 7)
+    return np.ascontiguousarray(pixels[:: -1 if rows_reversed else 1, :: -1 if columns_reversed else 1])
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """The file open for reading; every reason why it cannot be as an ImageReadError."""
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise ImageReadError(f"is a folder, not a file: {path}")
+        if not stat.S_ISREG(mode):  # a pipe or a device may never end
+            raise ImageReadError(f"is not a regular file: {path}")
+        with path.open("rb") as file:
+            yield file
+    except FileNotFoundError:
+        raise ImageReadError(f"does not exist: {path}") from None
+    except PermissionError:
+        raise ImageReadError(f"may not be read (permission denied): {path}") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise ImageReadError(f"cannot be read ({one_line(error)}): {path}") from error
+
+
+def _format(head: bytes, path: Path) -> Format:
+    if not head:
+        raise ImageReadError(f"is empty: {path}")
+    try:
+        return of_bytes(head)
+    except Refused as refusal:
+        raise ImageReadError(f"{refusal}: {path}") from None
+
+
+def _decoded(data: bytes, format: Format, page: int, max_pixels: float, path: Path) -> tuple[Header, Picture]:
+    """The header and the upright pixels; whatever a decoder raises as an ImageReadError."""
+    try:
+        decoder = decoder_for(format, page)
+        header = decoder.read_header(data)
+        _check_size(header.size, max_pixels)
+        pixels = decoder.decode(data)
+        if size_of(pixels) != header.size:
+            raise ValueError(f"the header says {header.size}, the pixels are {size_of(pixels)}")
+        return header, upright(pixels, header.orientation)
+    except Refused as refusal:
+        raise ImageReadError(f"{refusal}: {path}") from refusal
+    except Exception as error:
+        # Decoders raise what they like on damaged bytes: struct, index, zlib, memory, their own.
+        raise ImageReadError(f"is damaged, or no {format.name} that can be read ({one_line(error)}): {path}") from error
+
+
+def _check_size(size: tuple[int, int], max_pixels: float) -> None:
+    w, h = size
+    if w < 1 or h < 1:
+        raise Refused(f"has no pixels ({w} x {h})")
+    if w * h > max_pixels:
+        raise Refused(f"has {w * h / 1e6:,.1f} megapixels ({w} x {h}), more than the {max_pixels / 1e6:,.1f} allowed")
