@@ -1,4 +1,4 @@
-"""The family of models: translation, rigid, similarity, affine, homography, from the simplest to the most general.
+"""The family of models: identity, translation, rigid, similarity, affine, homography, from the simplest to the most general.
 
 Each is a group of transforms and a subgroup of the next, so one table says all there is to know of a model: how many
 points fix it, how to solve it from points, and the directions (generators of its Lie algebra) in which it can move,
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from autoalign.geometry.homography import Array, Mask, as_points, dlt, four_point, project, unit
 
-ModelName = Literal["translation", "rigid", "similarity", "affine", "homography"]
+ModelName = Literal["identity", "translation", "rigid", "similarity", "affine", "homography"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
 
 _Solver = Callable[[Array, Array, Array], Array]
@@ -50,6 +50,10 @@ def _assemble(linear: Array, src_mean: Array, dst_mean: Array) -> Array:
     out[..., :2, 2] = dst_mean - np.einsum("...ij,...j->...i", linear, src_mean)
     out[..., 2, 2] = 1.0
     return unit(out)
+
+
+def _solve_identity(src: Array, dst: Array, weights: Array) -> Array:
+    return np.broadcast_to(unit(np.eye(3)), (*src.shape[:-2], 3, 3)).copy()
 
 
 def _solve_translation(src: Array, dst: Array, weights: Array) -> Array:
@@ -109,6 +113,7 @@ _TILT_X, _TILT_Y = _generator((2, 0, 1.0)), _generator((2, 1, 1.0))
 MODELS: dict[ModelName, Model] = {
     model.name: model
     for model in (
+        Model(name="identity", sample_size=0, generators=np.zeros((0, 3, 3)), solve=_solve_identity),
         Model(name="translation", sample_size=1, generators=np.stack([_MOVE_X, _MOVE_Y]), solve=_solve_translation),
         Model(name="rigid", sample_size=2, generators=np.stack([_MOVE_X, _MOVE_Y, _TURN]), solve=_solve_rigid),
         Model(

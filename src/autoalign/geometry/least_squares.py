@@ -138,6 +138,8 @@ def polish(
     as the fit improves, and never below `sigma_floor` sigmas. Returns (3, 3) of unit norm; `transform` itself where no
     step improves it.
     """
+    if not model.degrees_of_freedom:
+        return transform
     norm = normalisation(pairs.src)
     damping = 1e-3
     at = _linearise(model, transform, pairs, norm)

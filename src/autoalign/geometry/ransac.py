@@ -177,8 +177,9 @@ def _trials_needed(inliers: Mask, tops: NDArray[np.int64], m: int, confidence: f
     """Draws after which a sample of inliers only has been missed with a chance under 1 - confidence.
 
     The draws were spent on growing sets of the best matches, so each draw counts with the inlier share of its own set.
+    The sample that gave the transform agrees with it whatever it is, so it does not count.
     """
-    share = np.cumsum(inliers)[tops - 1] / tops
+    share = np.maximum(np.cumsum(inliers)[tops - 1] - m, 0) / tops
     chance = np.clip(share**m, 1e-12, 1 - 1e-12)
     missed = np.cumsum(np.log1p(-chance))
     return int(np.searchsorted(-missed, -np.log(1 - confidence))) + 1

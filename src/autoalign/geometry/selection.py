@@ -1,0 +1,41 @@
+"""Which model of the family explains the correspondences: the simplest that fits no worse than chance allows.
+
+Source: Schwarz 1978 (BIC), with a robust error, in the spirit of Torr's GRIC (1998). The scale of the noise is taken from
+the most general model.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from autoalign.geometry.family import MODELS, Model, ModelName, fit
+from autoalign.geometry.homography import Array, symmetric_transfer_error_squared
+from autoalign.geometry.least_squares import Correspondences, polish, robust_scale
+
+_CLIP_SIGMAS = 4.0
+
+
+def simplest_model(general: ModelName, dst_from_src: Array, pairs: Correspondences) -> tuple[ModelName, Array]:
+    """The model of least BIC among `general` and those inside it, and its transform (3, 3) fitted to `pairs`.
+
+    `dst_from_src` is the fitted transform of the general model.
+    """
+    sigma = robust_scale(_errors(dst_from_src, pairs), 0.01)
+    best, chosen = _criterion(MODELS[general], dst_from_src, pairs, sigma), (general, dst_from_src)
+    for model in MODELS.values():
+        if model.name == general:
+            break
+        transform = polish(model, fit(model.name, pairs.src, pairs.dst), pairs, sigma_floor=sigma)
+        criterion = _criterion(model, transform, pairs, sigma)
+        if criterion < best:
+            best, chosen = criterion, (model.name, transform)
+    return chosen
+
+
+def _errors(transform: Array, pairs: Correspondences) -> Array:
+    return symmetric_transfer_error_squared(transform, pairs.src, pairs.dst, pairs.src_sigma, pairs.dst_sigma)
+
+
+def _criterion(model: Model, transform: Array, pairs: Correspondences, sigma: float) -> float:
+    misfit = np.minimum(_errors(transform, pairs) / sigma**2, _CLIP_SIGMAS**2).sum()
+    return float(misfit + model.degrees_of_freedom * np.log(2 * len(pairs)))

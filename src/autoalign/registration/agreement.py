@@ -1,0 +1,121 @@
+"""Do the pixels under the overlay agree, and where? What a shared caption or logo cannot fake.
+
+The overlap is cut into blocks; a block agrees if the two pictures correlate in it better than nearly all blocks do with
+a block from elsewhere. True overlays agree all over, two pictures with one caption only under the caption.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from autoalign.geometry.homography import Array, Mask, jacobian, project, translation
+from autoalign.geometry.uncertainty import overlap_points
+from autoalign.picture.pixels import resize_map, size_of
+from autoalign.picture.warp import warp
+
+_OVERLAY_PIXELS = 0.1e6  # the overlap is looked at in so many pixels: coarse, so that a pixel or two do not matter
+_BLOCK = 12  # px of the overlay
+_FLAT = 3.0  # grey levels of standard deviation under which a block shows nothing
+_SHIFTS = 40  # block orders that make the chance distribution
+_CHANCE = 0.05  # share of blocks that agree by chance
+
+_Float = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """Blocks of the overlap that can tell, and those that agree."""
+
+    blocks: int  # with structure in either picture
+    agreeing: int  # of them, that correlate better than 19 in 20 by chance
+    correlation: float  # mean over the blocks, -1 to 1; of gradients where those agree better
+
+    @property
+    def share(self) -> float:
+        return self.agreeing / self.blocks if self.blocks else 0.0
+
+
+NO_AGREEMENT = Agreement(blocks=0, agreeing=0, correlation=0.0)
+
+
+def agreement(
+    fixed: NDArray[np.uint8], moving: NDArray[np.uint8], fixed_from_moving: Array,
+    fixed_valid: Mask | None = None, moving_valid: Mask | None = None,
+) -> Agreement:
+    """How far two 8-bit grey pictures (h, w) agree under a (3, 3) transform, where both are valid."""
+    inside = overlap_points(fixed_from_moving, size_of(moving), size_of(fixed))
+    if len(inside) < 4:
+        return NO_AGREEMENT
+    overlay = _overlay(fixed, moving, fixed_from_moving, inside, fixed_valid, moving_valid)
+    if overlay is None:
+        return NO_AGREEMENT
+    looks = (_compare(*overlay), _compare(_edges(overlay[0]), _edges(overlay[1]), overlay[2]))
+    return max(looks, key=lambda look: look.share)
+
+
+def _overlay(
+    fixed: NDArray[np.uint8], moving: NDArray[np.uint8], fixed_from_moving: Array, inside: Array,
+    fixed_valid: Mask | None, moving_valid: Mask | None,
+) -> tuple[_Float, _Float, Mask] | None:
+    """Both pictures over the overlap, at the same coarse resolution, and where both have data."""
+    there, _ = project(fixed_from_moving, inside)
+    w, h = size_of(fixed)
+    x0, y0 = np.clip(np.floor(there.min(0)), 0, (w - 1, h - 1)).astype(int)
+    x1, y1 = np.clip(np.ceil(there.max(0)), 0, (w - 1, h - 1)).astype(int) + 1
+    factor = max(1.0, float(np.sqrt((x1 - x0) * (y1 - y0) / _OVERLAY_PIXELS)))
+    if min(x1 - x0, y1 - y0) < 2 * _BLOCK * factor:
+        return None
+    small_fixed, crop_from_small = _smaller(fixed[y0:y1, x0:x1], factor)
+    zoom = float(np.median(np.sqrt(np.abs(np.linalg.det(jacobian(fixed_from_moving, inside))))))
+    small_moving, moving_from_small = _smaller(moving, max(1.0, factor / max(zoom, 1e-6)))
+    small_from_moving = np.linalg.inv(crop_from_small) @ translation(-x0, -y0) @ fixed_from_moving
+    warped = warp(small_moving, size_of(small_fixed), small_from_moving @ moving_from_small)
+    valid = warped.valid
+    if fixed_valid is not None:
+        crop = fixed_valid[y0:y1, x0:x1].astype(np.uint8)
+        valid &= cv2.resize(crop, size_of(small_fixed), interpolation=cv2.INTER_NEAREST) > 0
+    if moving_valid is not None:
+        usable = moving_valid.astype(np.uint8)
+        valid &= warp(usable, size_of(small_fixed), small_from_moving, interpolation="nearest").pixels > 0
+    return small_fixed, warped.pixels, valid
+
+
+def _smaller(image: NDArray[np.uint8] | _Float, factor: float) -> tuple[_Float, Array]:
+    w, h = size_of(image)
+    size = (max(1, round(w / factor)), max(1, round(h / factor)))
+    small = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.GaussianBlur(small, (0, 0), 0.7)), resize_map((w, h), size)
+
+
+def _edges(image: _Float) -> _Float:
+    """Gradient magnitude: the same for opposite contrasts."""
+    return np.asarray(cv2.magnitude(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1)) / 4)
+
+
+def _blocks(image: NDArray[np.generic]) -> NDArray[np.generic]:
+    """(n, block x block) the whole blocks of a picture (h, w)."""
+    rows, columns = image.shape[0] // _BLOCK, image.shape[1] // _BLOCK
+    cut = image[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK)
+    return np.asarray(cut.transpose(0, 2, 1, 3).reshape(rows * columns, _BLOCK * _BLOCK))
+
+
+def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
+    whole = np.asarray(_blocks(valid)).all(1)
+    a, b = (np.asarray(_blocks(p), np.float32)[whole] for p in (fixed, moving))
+    a_contrast, b_contrast = a.std(1), b.std(1)
+    told = np.maximum(a_contrast, b_contrast) > _FLAT
+    a, b, a_contrast, b_contrast = a[told], b[told], a_contrast[told], b_contrast[told]
+    if len(a) < 8:
+        return NO_AGREEMENT
+    # A contrast of one grey level stands for the noise, so that a flat block does not agree with a rich one.
+    a = (a - a.mean(1, keepdims=True)) / np.hypot(a_contrast, 1.0)[:, None]
+    b = (b - b.mean(1, keepdims=True)) / np.hypot(b_contrast, 1.0)[:, None]
+    correlation = (a * b).mean(1)
+    shifts = np.unique(np.linspace(1, len(a) - 1, _SHIFTS).astype(int))
+    by_chance = np.concatenate([(a * np.roll(b, int(s), axis=0)).mean(1) for s in shifts])
+    agreeing = correlation > np.quantile(by_chance, 1.0 - _CHANCE)
+    return Agreement(blocks=len(a), agreeing=int(agreeing.sum()), correlation=float(correlation.mean()))

@@ -1,0 +1,343 @@
+"""Consensus -> sub-pixel transform with its uncertainty, by least-squares matching of patches at full resolution.
+
+Patches around corners of the fixed picture are compared with the moving picture seen through the current transform.
+One Gauss-Newton step per patch says how far it is off, robust least squares over all patches moves the transform, and
+the patches are sampled again, first on shrunken pictures, then on the full ones. Each patch is reduced to mean 0 and
+contrast 1, which is what makes it work under other light; gradients are the mean of both pictures', which makes the
+step of second order and the same for swapped roles (so that a forward-backward check would say nothing).
+
+A part of the patches takes no part in the fit and decides whether it helped, and the keypoints must not deny it.
+
+Sources: Gruen 1985 (least-squares matching); Lucas and Kanade 1981; Benhimane and Malis 2004 (efficient second-order).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from autoalign.geometry.family import MODELS, Model
+from autoalign.geometry.homography import (
+    Array,
+    Mask,
+    apply,
+    invert,
+    jacobian,
+    project,
+    symmetric_transfer_error_squared,
+    unit,
+)
+from autoalign.geometry.least_squares import Correspondences, polish
+from autoalign.geometry.ransac import Consensus
+from autoalign.picture.pixels import Picture, resize_map, shrink, size_of, to_8_bit
+
+_HELD_OUT = 5  # every fifth patch judges
+_SMOOTHING = 0.55  # px; takes away what bilinear sampling would distort (measured: 0.4 to 0.7 are alike, 1.0 is worse)
+_Float = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineOptions:
+    """How the transform is sharpened on the pixels."""
+
+    patches: int = 1500  # at most; 0 leaves the transform of the keypoints as it is
+    radius: int = 12  # a patch is 2 x radius + 1 pixels wide
+    rounds: int = 3  # on the full pictures
+    min_correlation: float = 0.6  # a patch takes part if its normalised correlation is above
+    max_shift: float = 2.0  # px; a patch that wants to move further is dropped
+
+    def __post_init__(self) -> None:
+        if self.patches < 0 or self.radius < 3 or self.rounds < 1 or not 0 < self.min_correlation < 1:
+            raise ValueError(f"RefineOptions out of range: {self}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Patches:
+    """What was measured on the pixels, under the transform that came out."""
+
+    pairs: Correspondences  # src moving px, dst fixed px, n
+    before: Array  # (n,) normalised correlation under the consensus
+    after: Array  # (n,) the same under the result
+    kept: Mask  # (n,) took part in the fit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """The transform that explains the pixels best, and the evidence it rests on."""
+
+    fixed_from_moving: Array  # (3, 3) of unit norm
+    pairs: Correspondences  # the inliers its uncertainty is computed from: patches if sharpened, else keypoints
+    patches: Patches | None  # None where too few could be compared
+    sharpened: bool  # False: the transform is the consensus's, because the patches did not prove better
+
+
+def refine(
+    fixed: Picture,
+    moving: Picture,
+    consensus: Consensus,
+    matched: Correspondences,
+    options: RefineOptions,
+    masks: tuple[Mask | None, Mask | None] = (None, None),
+    skip: bool = False,
+) -> Refinement:
+    """Sharpen `consensus.dst_from_src` (fixed from moving) on the grey pictures (h, w) at their full size.
+
+    `masks` (fixed, moving) are True where pixels may be used. Returns the consensus unchanged where patches are few or
+    do not prove better, and where `skip` says that it is not worth the time.
+    """
+    unchanged = Refinement(
+        fixed_from_moving=consensus.dst_from_src, pairs=matched[consensus.inliers], patches=None, sharpened=False
+    )
+    if skip or options.patches == 0:
+        return unchanged
+    model = MODELS[consensus.model]
+    transform = consensus.dst_from_src
+    corners = _corners(fixed, transform, size_of(moving), options, masks)
+    judges = np.arange(len(corners)) % _HELD_OUT == 0
+    seen: _Look | None = None
+    for level in _levels(fixed, moving, transform, consensus, matched):
+        for _ in range(options.rounds if level.shrunk == 1 else 2):
+            seen = _look(level, transform, corners, options)
+            moved = _fit(model, transform, seen, judges, options)
+            if moved is None:
+                return unchanged
+            transform = moved
+    first = _look(level, consensus.dst_from_src, corners, options)
+    last = _look(level, transform, corners, options)
+    patches = Patches(pairs=last.pairs, before=first.correlation, after=last.correlation, kept=_usable(last, options))
+    helped = _helped(first, last, judges & (first.inside | last.inside))
+    if not helped or _contradicts(model, consensus, transform, matched):
+        return Refinement(
+            fixed_from_moving=consensus.dst_from_src, pairs=unchanged.pairs, patches=patches, sharpened=False
+        )
+    return Refinement(
+        fixed_from_moving=transform, pairs=last.pairs[patches.kept], patches=patches, sharpened=True
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Level:
+    """Both pictures brought to about the same resolution, smoothed, and the maps to their full sizes."""
+
+    fixed: _Float
+    moving: _Float
+    fixed_from_level: Array
+    moving_from_level: Array
+    shrunk: float  # against the finest level
+
+
+def _levels(
+    fixed: Picture, moving: Picture, transform: Array, consensus: Consensus, matched: Correspondences
+) -> list[_Level]:
+    """From the level at which the consensus is good to about a pixel to the finest, by halves."""
+    centre = matched.src[consensus.inliers].mean(0, keepdims=True)
+    zoom = float(np.sqrt(abs(np.linalg.det(jacobian(transform, centre)[0]))))  # fixed px per moving px
+    fixed_shrink, moving_shrink = max(1.0, zoom), max(1.0, 1.0 / zoom)
+    doubt_px = float(np.median(matched.dst_sigma[consensus.inliers])) / fixed_shrink
+    halvings = int(np.clip(np.round(np.log2(max(doubt_px, 1.0))), 0, 4))
+    return [
+        _level(fixed, moving, fixed_shrink * 2**h, moving_shrink * 2**h, 2**h) for h in range(halvings, -1, -1)
+    ]
+
+
+def _level(fixed: Picture, moving: Picture, fixed_shrink: float, moving_shrink: float, shrunk: float) -> _Level:
+    small_fixed, fixed_from_level = _shrunk(fixed, fixed_shrink)
+    small_moving, moving_from_level = _shrunk(moving, moving_shrink)
+    return _Level(
+        fixed=small_fixed,
+        moving=small_moving,
+        fixed_from_level=fixed_from_level,
+        moving_from_level=moving_from_level,
+        shrunk=shrunk,
+    )
+
+
+def _shrunk(image: Picture, factor: float) -> tuple[_Float, Array]:
+    """The picture as smoothed float32, smaller by `factor`, and the (3, 3) map back to its own pixels."""
+    w, h = size_of(image)
+    size = (max(1, round(w / factor)), max(1, round(h / factor)))
+    small = image if size == (w, h) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), _SMOOTHING)), resize_map((w, h), size)
+
+
+def _corners(
+    fixed: Picture, transform: Array, moving_size: tuple[int, int], options: RefineOptions,
+    masks: tuple[Mask | None, Mask | None],
+) -> Array:
+    """(n, 2) corners of the fixed picture, spread, whose patches lie in both pictures."""
+    small = shrink(to_8_bit(fixed), 1e6)
+    w, h = size_of(small.pixels)
+    apart = max(4.0, np.sqrt(w * h / options.patches) * 0.6)
+    usable, moving_usable = masks
+    mask = None if usable is None else cv2.resize(usable.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
+    found = cv2.goodFeaturesToTrack(small.pixels, 3 * options.patches, 0.003, apart, mask=mask, blockSize=7)
+    if found is None:
+        return np.zeros((0, 2))
+    points = apply(small.full_from_small, found.reshape(-1, 2))
+    there, w_there = project(invert(transform), points)
+    inside = (w_there > 0) & (there > 0).all(1) & (there < np.array(moving_size) - 1).all(1)
+    if moving_usable is not None:
+        column, row = np.rint(there[inside]).astype(int).T
+        inside[inside] = moving_usable[row, column]
+    return points[inside][: options.patches]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Look:
+    """All patches compared under one transform."""
+
+    pairs: Correspondences  # (n) src: where the patch is in moving, dst: where it is in fixed, full px
+    shift: Array  # (n, 2) how far it wants to move, level px
+    correlation: Array  # (n,) -1 where it lies outside
+    inside: Mask  # (n,)
+
+
+def _look(level: _Level, transform: Array, corners: Array, options: RefineOptions) -> _Look:
+    """Sample, normalise and compare all patches; one Gauss-Newton step each."""
+    reach = options.radius + 1  # one more for the gradients
+    level_from_fixed, level_from_moving = np.linalg.inv(level.fixed_from_level), np.linalg.inv(level.moving_from_level)
+    small_from_small = unit(level_from_moving @ invert(transform) @ level.fixed_from_level)
+    centres = np.rint(apply(level_from_fixed, corners)).astype(np.int64)
+    inside = _patch_inside(centres, reach, size_of(level.fixed), np.eye(3), size_of(level.fixed))
+    inside &= _patch_inside(centres, reach, size_of(level.fixed), small_from_small, size_of(level.moving))
+    shift, correlation, sigma = np.zeros((len(corners), 2)), np.full(len(corners), -1.0), np.ones(len(corners))
+    if inside.any():
+        a = _fixed_patches(level.fixed, centres[inside], reach)
+        b = _moving_patches(level.moving, small_from_small, centres[inside], reach)
+        shift[inside], correlation[inside], sigma[inside] = _gauss_newton(a, b)
+    at = centres.astype(np.float64)
+    src = np.where(inside[:, None], project(small_from_small, at + shift)[0], 0.0)
+    fixed_px, moving_px = level.fixed_from_level[0, 0], level.moving_from_level[0, 0]
+    return _Look(
+        pairs=Correspondences(
+            src=apply(level.moving_from_level, src),
+            dst=apply(level.fixed_from_level, at),
+            src_sigma=sigma * moving_px,
+            dst_sigma=sigma * fixed_px,
+        ),
+        shift=shift,
+        correlation=correlation,
+        inside=inside,
+    )
+
+
+def _patch_inside(
+    centres: NDArray[np.int64], reach: int, own: tuple[int, int], transform: Array, other: tuple[int, int]
+) -> Mask:
+    """(n,) True where the four corners of a patch, seen through `transform`, lie in a picture of size `other`."""
+    ok = np.ones(len(centres), bool)
+    for dx, dy in ((-reach, -reach), (reach, -reach), (reach, reach), (-reach, reach)):
+        there, w = project(transform, centres + np.array([dx, dy], np.float64))
+        with np.errstate(invalid="ignore"):
+            ok &= (w > 0) & (there >= 0).all(1) & (there <= np.array(other) - 1).all(1)
+    return ok
+
+
+def _fixed_patches(image: _Float, centres: NDArray[np.int64], reach: int) -> _Float:
+    """(n, s, s) patches at whole pixels."""
+    windows = np.lib.stride_tricks.sliding_window_view(image, (2 * reach + 1, 2 * reach + 1))
+    return np.asarray(windows[centres[:, 1] - reach, centres[:, 0] - reach])
+
+
+def _moving_patches(image: _Float, moving_from_fixed: Array, centres: NDArray[np.int64], reach: int) -> _Float:
+    """(n, s, s) patches of the moving picture on the pixel grid of the fixed one, bilinear."""
+    side = 2 * reach + 1
+    offset = np.arange(-reach, reach + 1, dtype=np.float64)
+    x = (centres[:, 0, None, None] + offset[None, None, :]).astype(np.float64)
+    y = (centres[:, 1, None, None] + offset[None, :, None]).astype(np.float64)
+    t = moving_from_fixed
+    w = t[2, 0] * x + t[2, 1] * y + t[2, 2]
+    map_x = ((t[0, 0] * x + t[0, 1] * y + t[0, 2]) / w).astype(np.float32)
+    map_y = ((t[1, 0] * x + t[1, 1] * y + t[1, 2]) / w).astype(np.float32)
+    n = len(centres)
+    # Sheets of 8000 rows: cv2.remap refuses sides over 32,767 px.
+    per_sheet = max(1, 8000 // side)
+    sheets = [
+        cv2.remap(
+            image, map_x[i : i + per_sheet].reshape(-1, side), map_y[i : i + per_sheet].reshape(-1, side),
+            cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
+        )
+        for i in range(0, n, per_sheet)
+    ]
+    return np.asarray(np.concatenate(sheets).reshape(n, side, side))
+
+
+def _normalise(patches: _Float, window: _Float) -> tuple[_Float, _Float]:
+    """Patches (n, s, s) with weighted mean 0 and weighted variance 1, and their standard deviations (n,)."""
+    mean = np.einsum("nij,ij->n", patches, window)
+    centred = patches - mean[:, None, None]
+    deviation = np.sqrt(np.einsum("nij,nij,ij->n", centred, centred, window, optimize=False))
+    return centred / np.maximum(deviation, 1e-6)[:, None, None], deviation
+
+
+def _gauss_newton(a: _Float, b: _Float) -> tuple[Array, Array, Array]:
+    """Shift (n, 2) of b against a in px, normalised correlation (n,), and the shift's standard deviation (n,).
+
+    a, b are patches (n, s, s) with a rim of one pixel that only serves the gradients.
+    """
+    side = a.shape[1] - 2
+    bell = np.exp(-0.5 * (np.arange(side) - (side - 1) / 2) ** 2 / (side / 3.5) ** 2)
+    window = (np.outer(bell, bell) / bell.sum() ** 2).astype(np.float32)
+    rimmed = np.zeros((side + 2, side + 2), np.float32)
+    rimmed[1:-1, 1:-1] = window
+    (a, a_contrast), (b, b_contrast) = _normalise(a, rimmed), _normalise(b, rimmed)
+    both = 0.25 * (a + b)
+    gx = both[:, 1:-1, 2:] - both[:, 1:-1, :-2]
+    gy = both[:, 2:, 1:-1] - both[:, :-2, 1:-1]
+    inner_a, inner_b = a[:, 1:-1, 1:-1], b[:, 1:-1, 1:-1]
+    difference = inner_a - inner_b
+    wx, wy = gx * window, gy * window
+    xx, xy, yy = (np.einsum("nij,nij->n", p, q).astype(np.float64) for p, q in ((wx, gx), (wx, gy), (wy, gy)))
+    ex, ey = (np.einsum("nij,nij->n", p, difference).astype(np.float64) for p in (wx, wy))
+    determinant = np.maximum(xx * yy - xy * xy, 1e-12)
+    shift = np.stack([yy * ex - xy * ey, xx * ey - xy * ex], 1) / determinant[:, None]
+    correlation = np.einsum("nij,nij,ij->n", inner_a, inner_b, window).astype(np.float64)
+    flat = (a_contrast < 1e-3) | (b_contrast < 1e-3)
+    correlation[flat] = -1.0
+    # Variance of the mean of about s^2 / 4 independent pixels with the noise that the correlation leaves.
+    noise = np.maximum(1.0 - correlation, 1e-4) * 2.0 * 4.0 / side**2
+    sigma = np.sqrt(noise * (xx + yy) / (2.0 * determinant))
+    return shift, correlation, np.clip(sigma, 0.01, 2.0)
+
+
+def _usable(seen: _Look, options: RefineOptions) -> Mask:
+    return np.asarray(
+        seen.inside
+        & (seen.correlation > options.min_correlation)
+        & (np.abs(seen.shift).max(1) < options.max_shift)
+        & (seen.pairs.dst_sigma < 1.0 * options.max_shift)
+    )
+
+
+def _fit(model: Model, transform: Array, seen: _Look, judges: Mask, options: RefineOptions) -> Array | None:
+    """Robust least squares on the patches that do not judge; None where they are too few to trust."""
+    used = _usable(seen, options) & ~judges
+    if used.sum() < 3 * model.degrees_of_freedom:
+        return None
+    return polish(model, transform, seen.pairs[used], sigma_floor=0.02)
+
+
+def _helped(first: _Look, last: _Look, judges: Mask) -> bool:
+    """The held-out patches correlate no worse on the whole, and more of them better than worse."""
+    gain = last.correlation[judges] - first.correlation[judges]
+    return bool(len(gain) >= 3 and np.median(gain) >= 0 and (gain > 0).sum() >= (gain < 0).sum())
+
+
+def _contradicts(model: Model, consensus: Consensus, transform: Array, matched: Correspondences) -> bool:
+    """True where the keypoints deny the transform: their squared error rises by more than the noise of their own fit.
+
+    If `transform` were the truth, the error at it would exceed that at the keypoints' own least squares by a chi-square
+    of as many degrees as the model has. A scene that is no plane breaks this: its patches vote for one plane of it.
+    """
+    pairs = matched[consensus.inliers]
+
+    def cost(of: Array) -> float:
+        error = symmetric_transfer_error_squared(of, pairs.src, pairs.dst, pairs.src_sigma, pairs.dst_sigma)
+        return float(np.minimum(error, consensus.errors[consensus.inliers].max() ** 2).sum())
+
+    freedom = model.degrees_of_freedom
+    rise = (cost(transform) / max(cost(consensus.dst_from_src), 1e-12) - 1.0) * max(2 * len(pairs) - freedom, 1)
+    return rise > freedom + 6.0 * np.sqrt(2.0 * freedom)

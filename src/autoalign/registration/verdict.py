@@ -1,0 +1,272 @@
+"""Evidence -> aligned | doubtful | rejected, the reason in words and numbers, the error to expect in pixels.
+
+A consensus proves that two pictures share something; a caption is something. So three questions are asked in turn:
+could random matches agree as well (a-contrario), could a camera have made this transform (geometry), and do the pixels
+under the overlay agree all over it, not only where the matches are. Last, the expected error says what it is good for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from autoalign.geometry.chance import disc_chance, first_in_each_cell, log10_false_alarms
+from autoalign.geometry.family import MODELS, ModelName
+from autoalign.geometry.homography import Array, invert, jacobian, project
+from autoalign.geometry.least_squares import Correspondences, polish
+from autoalign.geometry.ransac import Consensus
+from autoalign.geometry.uncertainty import overlap_points, overlap_share, point_errors, uncertainty
+from autoalign.registration.agreement import Agreement
+
+Status = Literal["aligned", "doubtful", "rejected"]
+
+_SPOT_SIGMAS = 5.0  # matches nearer than this are one observation
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerdictOptions:
+    """What is asked of the evidence before it counts."""
+
+    max_log10_false_alarms: float = -4.0  # of the consensus: random matches agree as well with a chance of 1 in 10^4
+    sure_log10_false_alarms: float = -12.0  # above, the pixels must agree more clearly
+    min_agreement: float = 0.25  # share of the blocks of the overlap that agree; 0.05 do by chance
+    sure_agreement: float = 0.4  # below, the pair is doubtful
+    max_expected_error_px: float = 3.0  # above, and above max_expected_error_share, the pair is doubtful
+    max_expected_error_share: float = 0.005  # of the diagonal of the fixed picture
+    max_stretch: float = 20.0  # largest change of scale, either way, that a camera makes
+    max_anisotropy: float = 12.0  # largest ratio of the two scales at a point
+    min_overlap: float = 0.01  # share of the smaller picture
+
+    def __post_init__(self) -> None:
+        if self.max_expected_error_px <= 0 or self.max_stretch <= 1 or not 0 <= self.min_agreement <= 1:
+            raise ValueError(f"VerdictOptions out of range: {self}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """All that the verdict rests on, in numbers."""
+
+    matches: int
+    independent_matches: int  # at most one to a spot of either picture
+    independent_inliers: int
+    log10_false_alarms: float  # of the independent inliers
+    overlap: float  # share of the fixed picture that is covered
+    agreement: Agreement
+    stretch: tuple[float, float]  # least and greatest scale over the overlap, fixed px per moving px
+    anisotropy: float  # greatest ratio of the two scales at one point; inf if the overlay folds or mirrors
+    halves_px: float  # mean distance over the overlap of the transforms of two disjoint halves of the inliers
+    fit_px: float  # what the covariance of the fit leaves, mean over the overlap
+    model_px: float  # what the residuals show that the model cannot follow
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What to make of a pair."""
+
+    status: Status
+    reason: str  # one sentence with the numbers
+    advice: str  # what would help; empty for an aligned pair
+    expected_error_px: float | None  # mean over the overlap, px of the fixed picture; None if rejected
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """(w, h) of both pictures."""
+
+    fixed: tuple[int, int]
+    moving: tuple[int, int]
+
+
+def significant(pairs: Correspondences, consensus: Consensus, sizes: Sizes, options: VerdictOptions) -> bool:
+    """Whether the consensus is more than what random matches give."""
+    return _log10_false_alarms(pairs[_independent(pairs)], consensus, sizes) <= options.max_log10_false_alarms
+
+
+def weigh(
+    model: ModelName, transform: Array, pairs: Correspondences, consensus: Consensus, fitted: Correspondences,
+    agreed: Agreement, sizes: Sizes,
+) -> Evidence:
+    """Collect the evidence for a transform of the model `model`, fixed from moving.
+
+    `pairs` are all matches, src moving, dst fixed, the subject of `consensus`; `fitted` are those, or patches, that the
+    transform was fitted to in the end; `agreed` is what the pixels say.
+    """
+    alone = _independent(pairs)
+    independent, near = pairs[alone], consensus.inliers[alone]
+    overlap = overlap_points(transform, sizes.moving, sizes.fixed)
+    known = uncertainty(MODELS[model], transform, fitted)
+    stretch, anisotropy = _shape(transform, overlap)
+    return Evidence(
+        matches=len(pairs),
+        independent_matches=len(independent),
+        independent_inliers=int(near.sum()),
+        log10_false_alarms=_log10_false_alarms(independent, consensus, sizes),
+        overlap=overlap_share(transform, sizes.moving, sizes.fixed),
+        agreement=agreed,
+        stretch=stretch,
+        anisotropy=anisotropy,
+        halves_px=_halves(consensus, independent[near], overlap),
+        fit_px=_root_mean_square(point_errors(MODELS[model], transform, known, overlap)),
+        model_px=known.model_px,
+    )
+
+
+def _root_mean_square(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("inf")
+
+
+def _independent(pairs: Correspondences) -> Array:
+    """Indices of the matches that repeat no better one's spot, in either picture."""
+    by_dst = first_in_each_cell(pairs.dst / pairs.dst_sigma.mean(), _SPOT_SIGMAS)
+    return by_dst[first_in_each_cell(pairs.src[by_dst] / pairs.src_sigma.mean(), _SPOT_SIGMAS)]
+
+
+def _log10_false_alarms(independent: Correspondences, consensus: Consensus, sizes: Sizes) -> float:
+    chances = _chances(consensus.dst_from_src, independent, sizes.moving, sizes.fixed)
+    return log10_false_alarms(chances, MODELS[consensus.model].sample_size)[0]
+
+
+def _chances(transform: Array, pairs: Correspondences, src_size: tuple[int, int], dst_size: tuple[int, int]) -> Array:
+    """(n,) probability that a random match agrees as well, the less telling of the two directions."""
+    chances = []
+    for to, src, dst, sigma, size in (
+        (transform, pairs.src, pairs.dst, pairs.dst_sigma, dst_size),
+        (invert(transform), pairs.dst, pairs.src, pairs.src_sigma, src_size),
+    ):
+        there, w = project(to, src)
+        with np.errstate(invalid="ignore", over="ignore"):
+            error = np.where(w > 0, np.linalg.norm(there - dst, axis=1), np.inf)
+        chances.append(disc_chance(error, size, float(np.median(sigma)) if len(sigma) else 1.0))
+    return np.maximum(*chances)
+
+
+def _shape(transform: Array, points: Array) -> tuple[tuple[float, float], float]:
+    """Least and greatest scale over points, and the greatest anisotropy; a fold or a mirror is infinitely bad."""
+    if not len(points):
+        return (0.0, float("inf")), float("inf")
+    slope = jacobian(transform, points)
+    scales = np.linalg.svd(slope, compute_uv=False)
+    folds = (np.linalg.det(slope) <= 0).any()
+    anisotropy = float("inf") if folds else float((scales[:, 0] / np.maximum(scales[:, 1], 1e-12)).max())
+    return (float(scales[:, 1].min()), float(scales[:, 0].max())), anisotropy
+
+
+def _halves(consensus: Consensus, inliers: Correspondences, points: Array) -> float:
+    """Mean distance over points between the transforms that every other inlier and the rest give."""
+    model = MODELS[consensus.model]
+    if len(inliers) < 2 * (model.sample_size + 1) or not len(points):
+        return float("inf")
+    halves = [polish(model, consensus.dst_from_src, inliers[np.arange(i, len(inliers), 2)]) for i in (0, 1)]
+    (a, wa), (b, wb) = (project(half, points) for half in halves)
+    if (wa <= 0).any() or (wb <= 0).any():
+        return float("inf")
+    return float(np.linalg.norm(a - b, axis=1).mean())
+
+
+def expected_error(evidence: Evidence) -> float:
+    """Mean error over the overlap in fixed px: the fit's, what the model cannot follow, and a floor."""
+    return float(np.sqrt(evidence.fit_px**2 + evidence.model_px**2 + _FLOOR_PX**2))
+
+
+_FLOOR_PX = 0.002
+
+
+def nothing_found(matches: int) -> Verdict:
+    """The verdict where no transform was found."""
+    return Verdict(
+        status="rejected",
+        reason=f"{matches} matches, and no transform that more than a handful of them agree on",
+        advice="the pictures may show different things, or too little structure",
+        expected_error_px=None,
+    )
+
+
+def judge(evidence: Evidence, options: VerdictOptions, sizes: Sizes) -> Verdict:
+    """The verdict on the evidence."""
+    for failed, advice in _rejections(evidence, options):
+        return Verdict(status="rejected", reason=failed, advice=advice, expected_error_px=None)
+    error = expected_error(evidence)
+    for failed, advice in _doubts(evidence, error, options, sizes.fixed):
+        return Verdict(status="doubtful", reason=failed, advice=advice, expected_error_px=error)
+    return Verdict(status="aligned", reason=_praise(evidence), advice="", expected_error_px=error)
+
+
+def _agree(evidence: Evidence) -> str:
+    return f"{evidence.independent_inliers} of {evidence.independent_matches} independent matches agree"
+
+
+def _chance(log10_false_alarms: float) -> str:
+    return f"1 in 10^{-log10_false_alarms:.0f}" if log10_false_alarms < 0 else "certain"
+
+
+def _blocks(evidence: Evidence) -> str:
+    return f"{evidence.agreement.agreeing} of {evidence.agreement.blocks} blocks of the overlap agree"
+
+
+def _rejections(evidence: Evidence, options: VerdictOptions) -> list[tuple[str, str]]:
+    """Every reason to reject, the plainest first, each with what would help."""
+    least, greatest = evidence.stretch
+    found = []
+    if evidence.log10_false_alarms > options.max_log10_false_alarms:
+        found.append((
+            f"{_agree(evidence)}, which chance explains ({_chance(evidence.log10_false_alarms)}; "
+            f"{_chance(options.max_log10_false_alarms)} needed)",
+            "the pictures may show different things; --effort max looks harder",
+        ))
+    if evidence.anisotropy > options.max_anisotropy or greatest > options.max_stretch or least < 1 / options.max_stretch:
+        found.append((
+            f"{_agree(evidence)}, but on a transform that no camera makes (scales {least:.2g} to {greatest:.2g})",
+            "a simpler --model may hold",
+        ))
+    if evidence.overlap < options.min_overlap:
+        found.append((f"{_agree(evidence)}, but the pictures overlap by only {evidence.overlap:.1%}", ""))
+    if evidence.agreement.share < options.min_agreement:
+        found.append((
+            f"{_agree(evidence)}, but only {_blocks(evidence)}: what they share is a small part, as a caption or logo is",
+            "mask what the pictures share but do not show (--fixed-mask, --moving-mask)",
+        ))
+    return found
+
+
+def _doubts(
+    evidence: Evidence, error: float, options: VerdictOptions, fixed_size: tuple[int, int]
+) -> list[tuple[str, str]]:
+    """Every reason to doubt a pair that is not rejected."""
+    limit = max(options.max_expected_error_px, options.max_expected_error_share * float(np.hypot(*fixed_size)))
+    found = []
+    if evidence.log10_false_alarms > options.sure_log10_false_alarms and evidence.agreement.share < 0.6:
+        found.append((f"{_agree(evidence)}, few for a verdict, and {_blocks(evidence)}", "look at the overlay"))
+    if evidence.agreement.share < options.sure_agreement:
+        found.append((f"{_agree(evidence)}, but only {_blocks(evidence)}", "look at the overlay"))
+    if error > limit:
+        found.append((
+            f"{_agree(evidence)}, but they leave the transform open to {error:.1f} px",
+            "look at the overlay; a simpler --model is steadier far from the matches",
+        ))
+    return found
+
+
+def _praise(evidence: Evidence) -> str:
+    return f"{_agree(evidence)} ({_chance(evidence.log10_false_alarms)} by chance), {_blocks(evidence)}"
+
+
+def unfit_points(reason: str) -> Verdict:
+    """The verdict on typed points that fix no transform."""
+    return Verdict(status="rejected", reason=reason, advice="type more points, spread", expected_error_px=None)
+
+
+def judge_typed(transform: Array, pairs: Correspondences, options: VerdictOptions, sizes: Sizes) -> Verdict:
+    """The verdict on a transform fitted to points that a person typed: how well it fits all of them."""
+    there, _ = project(transform, pairs.src)
+    error = _root_mean_square(np.linalg.norm(there - pairs.dst, axis=1))
+    anisotropy = _shape(transform, overlap_points(transform, sizes.moving, sizes.fixed))[1]
+    limit = max(options.max_expected_error_px, options.max_expected_error_share * float(np.hypot(*sizes.fixed)))
+    if not np.isfinite(anisotropy):
+        return unfit_points(f"the {len(pairs)} typed points give a transform that folds or mirrors the picture, or misses it")
+    if error > limit:
+        reason = f"the {len(pairs)} typed points are off their transform by {error:.1f} px (root mean square)"
+        return Verdict(status="doubtful", reason=reason, advice="look for a mistyped point", expected_error_px=error)
+    reason = f"fitted to {len(pairs)} typed points, {error:.2g} px off (root mean square)"
+    return Verdict(status="aligned", reason=reason, advice="", expected_error_px=error)
