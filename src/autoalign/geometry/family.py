@@ -29,7 +29,9 @@ class Model:
     name: ModelName
     sample_size: int  # points that fix it
     generators: Array  # (dof, 3, 3): small moves are identity + sum of parameter x generator
-    solve: _Solver  # weighted least squares: src, dst (k, n, 2), weights (k, n) -> (k, 3, 3); exact for a minimal sample
+    solve: (
+        _Solver  # weighted least squares: src, dst (k, n, 2), weights (k, n) -> (k, 3, 3); exact for a minimal sample
+    )
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -53,7 +55,7 @@ def _assemble(linear: Array, src_mean: Array, dst_mean: Array) -> Array:
 
 
 def _solve_identity(src: Array, dst: Array, weights: Array) -> Array:
-    return np.broadcast_to(unit(np.eye(3)), (*src.shape[:-2], 3, 3)).copy()
+    return np.array(np.broadcast_to(unit(np.eye(3)), (*src.shape[:-2], 3, 3)))
 
 
 def _solve_translation(src: Array, dst: Array, weights: Array) -> Array:
@@ -160,7 +162,7 @@ def fit(model: ModelName, src: ArrayLike, dst: ArrayLike, weights: ArrayLike | N
     if len(src) != len(dst) or len(src) < member.sample_size:
         raise ValueError(f"{model} needs {member.sample_size} or more pairs of points, not {len(src)} and {len(dst)}")
     w = np.ones(len(src)) if weights is None else np.asarray(weights, np.float64)
-    transform = member.solve(src[None], dst[None], w[None])[0]
+    transform: Array = member.solve(src[None], dst[None], w[None])[0]
     if not np.isfinite(transform).all() or not (project(transform, src)[1] > 0).any():
         raise ValueError(f"the points do not fix the model {model}: too many of them are collinear or repeat")
     return transform

@@ -41,7 +41,7 @@ def scaling(sx: float, sy: float) -> Array:
 
 def unit(transform: Array) -> Array:
     """Scale to unit Frobenius norm; the sign is kept."""
-    return transform / np.linalg.norm(transform, axis=(-2, -1), keepdims=True)
+    return np.asarray(transform / np.linalg.norm(transform, axis=(-2, -1), keepdims=True))
 
 
 def shown(transform: Array) -> Array:
@@ -51,7 +51,7 @@ def shown(transform: Array) -> Array:
     """
     if abs(transform[2, 2]) < 1e-12 * np.linalg.norm(transform):
         raise ValueError("this transform sends the point (0, 0) to infinity: it has no form with [2, 2] == 1")
-    return transform / transform[2, 2]
+    return np.asarray(transform / transform[2, 2])
 
 
 def adjugate(transform: Array) -> Array:

@@ -63,8 +63,7 @@ def velocities(model: Model, points: Array, norm: Array) -> Array:
 def step(model: Model, transform: Array, parameters: Array, norm: Array) -> Array:
     """H exp(sum a_i G_i) of unit norm, the generators taken in the normalised frame."""
     generator = np.einsum("g,gij->ij", parameters, model.generators)
-    size = np.abs(generator).max()
-    halvings = max(0, int(np.ceil(np.log2(max(size, 1e-300) / 0.1))))
+    halvings = max(0, int(np.ceil(np.log2(max(float(np.abs(generator).max()), 1e-300) / 0.1))))
     scaled = generator / 2**halvings
     exponential, term = np.eye(3), np.eye(3)
     for k in range(1, 12):  # 0.3**12 / 12! is far under the rounding of a double
@@ -85,7 +84,7 @@ class _Linearised:
 
     @property
     def error_squared(self) -> Array:
-        return 0.5 * ((self.forward**2).sum(1) + (self.backward**2).sum(1))
+        return np.asarray(0.5 * ((self.forward**2).sum(1) + (self.backward**2).sum(1)))
 
 
 def _residuals(transform: Array, pairs: Correspondences) -> tuple[Array, Array, Array]:
@@ -152,7 +151,7 @@ def polish(
         normal, right = _normal_equations(at, tukey_weights(error, sigma))
         normal[np.diag_indices_from(normal)] *= 1.0 + damping
         try:
-            parameters = np.linalg.solve(normal, right)
+            parameters = np.asarray(np.linalg.solve(normal, right), np.float64)
         except np.linalg.LinAlgError:
             return transform
         candidate = step(model, transform, parameters, norm)

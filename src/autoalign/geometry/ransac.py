@@ -53,7 +53,9 @@ class Consensus:
         return int(self.inliers.sum())
 
 
-def ransac(pairs: Correspondences, model: ModelName = "homography", options: RansacOptions | None = None) -> Consensus | None:
+def ransac(
+    pairs: Correspondences, model: ModelName = "homography", options: RansacOptions | None = None
+) -> Consensus | None:
     """The consensus of `pairs`, which come best first; None where no transform has more support than its own sample.
 
     A transform that mirrors is never returned. The same pairs, model and options give the same bits.
@@ -129,7 +131,7 @@ def _draw(rng: np.random.Generator, tops: NDArray[np.int64], m: int) -> NDArray[
     samples[:, 0] = tops - 1
     samples[:, 1:] = (rng.random((len(tops), m - 1)) * (tops - 1)[:, None]).astype(np.int64)
     ordered = np.sort(samples, axis=1)
-    return samples[(ordered[:, 1:] != ordered[:, :-1]).all(1)]
+    return np.asarray(samples[(ordered[:, 1:] != ordered[:, :-1]).all(1)])
 
 
 def _hypotheses(model: Model, pairs: Correspondences, samples: NDArray[np.int64]) -> Array:
@@ -138,7 +140,9 @@ def _hypotheses(model: Model, pairs: Correspondences, samples: NDArray[np.int64]
     return transforms[sound & (determinant(transforms) > 0)]
 
 
-def _best_of(hypotheses: Array, pairs: Correspondences, glance: NDArray[np.int64], limit: float) -> tuple[Array | None, float]:
+def _best_of(
+    hypotheses: Array, pairs: Correspondences, glance: NDArray[np.int64], limit: float
+) -> tuple[Array | None, float]:
     """The hypothesis of least MSAC cost. All are judged one way on a few matches, the best tenth both ways on all."""
     if not len(hypotheses):
         return None, np.inf
@@ -154,7 +158,7 @@ def _one_way_cost(hypotheses: Array, pairs: Correspondences, limit: float) -> Ar
     projected, w = project(hypotheses, pairs.src)
     with np.errstate(invalid="ignore", over="ignore"):
         error = ((projected - pairs.dst) ** 2).sum(-1) / pairs.dst_sigma**2
-    return np.where(w > 0, np.fmin(error, limit), limit).sum(-1)
+    return np.asarray(np.where(w > 0, np.fmin(error, limit), limit).sum(-1))
 
 
 def _optimise_locally(

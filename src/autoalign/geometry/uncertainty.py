@@ -80,9 +80,7 @@ def point_errors(model: Model, dst_from_src: Array, known: Uncertainty, points: 
     return np.asarray(_MEAN_OF_LENGTH * np.sqrt(np.maximum(variance, 0.0)))
 
 
-def overlap_points(
-    dst_from_src: Array, src_size: tuple[int, int], dst_size: tuple[int, int], count: int = 32
-) -> Array:
+def overlap_points(dst_from_src: Array, src_size: tuple[int, int], dst_size: tuple[int, int], count: int = 32) -> Array:
     """(n, 2) points of a grid over the src picture (w, h) that land in the dst picture; empty if none does."""
     grid = np.stack(np.meshgrid(*(np.linspace(0, s - 1, count) for s in src_size)), -1).reshape(-1, 2)
     there, w = project(dst_from_src, grid)

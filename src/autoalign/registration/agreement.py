@@ -43,8 +43,11 @@ NO_AGREEMENT = Agreement(blocks=0, agreeing=0, correlation=0.0)
 
 
 def agreement(
-    fixed: NDArray[np.uint8], moving: NDArray[np.uint8], fixed_from_moving: Array,
-    fixed_valid: Mask | None = None, moving_valid: Mask | None = None,
+    fixed: NDArray[np.uint8],
+    moving: NDArray[np.uint8],
+    fixed_from_moving: Array,
+    fixed_valid: Mask | None = None,
+    moving_valid: Mask | None = None,
 ) -> Agreement:
     """How far two 8-bit grey pictures (h, w) agree under a (3, 3) transform, where both are valid."""
     inside = overlap_points(fixed_from_moving, size_of(moving), size_of(fixed))
@@ -58,8 +61,12 @@ def agreement(
 
 
 def _overlay(
-    fixed: NDArray[np.uint8], moving: NDArray[np.uint8], fixed_from_moving: Array, inside: Array,
-    fixed_valid: Mask | None, moving_valid: Mask | None,
+    fixed: NDArray[np.uint8],
+    moving: NDArray[np.uint8],
+    fixed_from_moving: Array,
+    inside: Array,
+    fixed_valid: Mask | None,
+    moving_valid: Mask | None,
 ) -> tuple[_Float, _Float, Mask] | None:
     """Both pictures over the overlap, at the same coarse resolution, and where both have data."""
     there, _ = project(fixed_from_moving, inside)

@@ -122,7 +122,7 @@ class Alignment:
         """`fixed_from_moving` for those who live in scikit-image. AlignmentError if rejected."""
         from skimage.transform import ProjectiveTransform
 
-        return ProjectiveTransform(self.fixed_from_moving)
+        return ProjectiveTransform(self.fixed_from_moving)  # type: ignore[no-untyped-call]
 
     @property
     def matches(self) -> int:
@@ -216,9 +216,7 @@ def align_points(
     if len(fixed_points) != len(moving_points):
         raise ValueError(f"{len(fixed_points)} points in fixed, but {len(moving_points)} in moving")
     attempt = _typed(fixed_points, moving_points, Sizes(fixed=fixed_size, moving=moving_size), options)
-    return Alignment(
-        fixed_size=fixed_size, moving_size=moving_size, options=options, attempts=(attempt,), best=attempt
-    )
+    return Alignment(fixed_size=fixed_size, moving_size=moving_size, options=options, attempts=(attempt,), best=attempt)
 
 
 def _typed(fixed_points: Array, moving_points: Array, sizes: Sizes, options: AlignOptions) -> Attempt:
@@ -262,7 +260,9 @@ def _concluded(attempt: Attempt, consensus: Consensus, pair: _Pair, options: Ali
     """The attempt with its consensus refined and judged."""
     with _timed(attempt.seconds, "refine"):
         sharp = significant(attempt.pairs, consensus, pair.sizes, options.verdict)
-        refinement = refine(pair.fixed, pair.moving, consensus, attempt.pairs, options.refine, pair.masks, skip=not sharp)
+        refinement = refine(
+            pair.fixed, pair.moving, consensus, attempt.pairs, options.refine, pair.masks, skip=not sharp
+        )
         model, transform = consensus.model, refinement.fixed_from_moving
         if options.model == "auto":
             model, transform = simplest_model(model, transform, refinement.pairs)

@@ -113,14 +113,14 @@ def _sift(image: NDArray[np.uint8], options: FeatureOptions, mask: NDArray[np.ui
     sift = cv2.SIFT.create(2 * options.max_features, contrastThreshold=options.contrast, enable_precise_upscale=True)
     keypoints, raw = sift.detectAndCompute(image, mask)
     chosen = _spread(keypoints, size_of(image), options.max_features)
-    raw = np.zeros((0, 128), np.float32) if raw is None else raw[chosen]
+    described = np.asarray(np.zeros((0, 128)) if raw is None else raw[chosen], np.float32)
     points, sizes, angles = _columns([keypoints[i] for i in chosen])
     return Features(
         points=points,
         sizes=sizes,
         angles=angles,
         sigmas=np.ones(len(points)),
-        descriptors=_whole_descriptors(raw, options.root),
+        descriptors=_whole_descriptors(described, options.root),
         detector="sift",
     )
 
@@ -142,7 +142,7 @@ def _orb(image: NDArray[np.uint8], options: FeatureOptions, mask: NDArray[np.uin
     # Smaller pictures have no room for its patches and make it fail.
     found = orb.detectAndCompute(image, mask) if min(image.shape) >= 64 else ((), None)
     chosen = _spread(found[0], size_of(image), options.max_features)
-    bits = np.zeros((0, 32), np.uint8) if found[1] is None else found[1][chosen]
+    bits = np.asarray(np.zeros((0, 32)) if found[1] is None else found[1][chosen], np.uint8)
     keypoints = [found[0][i] for i in chosen]
     points, sizes, angles = _columns(keypoints)
     octaves = np.array([k.octave for k in keypoints], np.int64)
@@ -150,7 +150,7 @@ def _orb(image: NDArray[np.uint8], options: FeatureOptions, mask: NDArray[np.uin
         points=_from_pyramid(points, octaves, size_of(image)),
         sizes=sizes,
         angles=angles,
-        sigmas=_ORB_STEP**octaves,
+        sigmas=np.asarray(_ORB_STEP**octaves, np.float64),
         descriptors=np.unpackbits(bits, axis=1).astype(np.float32) * 2 - 1,
         detector="orb",
     )

@@ -65,7 +65,7 @@ def _squared_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArra
     product *= -2
     product += (a * a).sum(1)[:, None]
     product += (b * b).sum(1)
-    return np.maximum(product, 0, out=product)
+    return np.asarray(np.maximum(product, 0, out=product))
 
 
 def _mutual(distance: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
@@ -96,7 +96,7 @@ def _second(
         gap = ((others.points[second] - others.points[nearest]) ** 2).sum(1)
         twin = (gap < reach) & np.isfinite(distance[rows, second])
         if not twin.any():
-            return distance[rows, second]
+            return np.asarray(distance[rows, second])
         distance[rows[twin], second[twin]] = np.inf
 
 

@@ -113,9 +113,7 @@ def refine(
         return Refinement(
             fixed_from_moving=consensus.dst_from_src, pairs=unchanged.pairs, patches=patches, sharpened=False
         )
-    return Refinement(
-        fixed_from_moving=transform, pairs=last.pairs[patches.kept], patches=patches, sharpened=True
-    )
+    return Refinement(fixed_from_moving=transform, pairs=last.pairs[patches.kept], patches=patches, sharpened=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,9 +136,7 @@ def _levels(
     fixed_shrink, moving_shrink = max(1.0, zoom), max(1.0, 1.0 / zoom)
     doubt_px = float(np.median(matched.dst_sigma[consensus.inliers])) / fixed_shrink
     halvings = int(np.clip(np.round(np.log2(max(doubt_px, 1.0))), 0, 4))
-    return [
-        _level(fixed, moving, fixed_shrink * 2**h, moving_shrink * 2**h, 2**h) for h in range(halvings, -1, -1)
-    ]
+    return [_level(fixed, moving, fixed_shrink * 2**h, moving_shrink * 2**h, 2**h) for h in range(halvings, -1, -1)]
 
 
 def _level(fixed: Picture, moving: Picture, fixed_shrink: float, moving_shrink: float, shrunk: float) -> _Level:
@@ -164,7 +160,10 @@ def _shrunk(image: Picture, factor: float) -> tuple[_Float, Array]:
 
 
 def _corners(
-    fixed: Picture, transform: Array, moving_size: tuple[int, int], options: RefineOptions,
+    fixed: Picture,
+    transform: Array,
+    moving_size: tuple[int, int],
+    options: RefineOptions,
     masks: tuple[Mask | None, Mask | None],
 ) -> Array:
     """(n, 2) corners of the fixed picture, spread, whose patches lie in both pictures."""
@@ -198,23 +197,21 @@ class _Look:
 def _look(level: _Level, transform: Array, corners: Array, options: RefineOptions) -> _Look:
     """Sample, normalise and compare all patches; one Gauss-Newton step each."""
     reach = options.radius + 1  # one more for the gradients
-    level_from_fixed, level_from_moving = np.linalg.inv(level.fixed_from_level), np.linalg.inv(level.moving_from_level)
-    small_from_small = unit(level_from_moving @ invert(transform) @ level.fixed_from_level)
-    centres = np.rint(apply(level_from_fixed, corners)).astype(np.int64)
+    moving_from_fixed = unit(invert(level.moving_from_level) @ invert(transform) @ level.fixed_from_level)
+    centres = np.rint(apply(invert(level.fixed_from_level), corners))
     inside = _patch_inside(centres, reach, size_of(level.fixed), np.eye(3), size_of(level.fixed))
-    inside &= _patch_inside(centres, reach, size_of(level.fixed), small_from_small, size_of(level.moving))
+    inside &= _patch_inside(centres, reach, size_of(level.fixed), moving_from_fixed, size_of(level.moving))
     shift, correlation, sigma = np.zeros((len(corners), 2)), np.full(len(corners), -1.0), np.ones(len(corners))
     if inside.any():
         a = _fixed_patches(level.fixed, centres[inside], reach)
-        b = _moving_patches(level.moving, small_from_small, centres[inside], reach)
+        b = _moving_patches(level.moving, moving_from_fixed, centres[inside], reach)
         shift[inside], correlation[inside], sigma[inside] = _gauss_newton(a, b)
-    at = centres.astype(np.float64)
-    src = np.where(inside[:, None], project(small_from_small, at + shift)[0], 0.0)
+    src = np.where(inside[:, None], project(moving_from_fixed, centres + shift)[0], 0.0)
     fixed_px, moving_px = level.fixed_from_level[0, 0], level.moving_from_level[0, 0]
     return _Look(
         pairs=Correspondences(
             src=apply(level.moving_from_level, src),
-            dst=apply(level.fixed_from_level, at),
+            dst=apply(level.fixed_from_level, centres),
             src_sigma=sigma * moving_px,
             dst_sigma=sigma * fixed_px,
         ),
@@ -224,9 +221,7 @@ def _look(level: _Level, transform: Array, corners: Array, options: RefineOption
     )
 
 
-def _patch_inside(
-    centres: NDArray[np.int64], reach: int, own: tuple[int, int], transform: Array, other: tuple[int, int]
-) -> Mask:
+def _patch_inside(centres: Array, reach: int, own: tuple[int, int], transform: Array, other: tuple[int, int]) -> Mask:
     """(n,) True where the four corners of a patch, seen through `transform`, lie in a picture of size `other`."""
     ok = np.ones(len(centres), bool)
     for dx, dy in ((-reach, -reach), (reach, -reach), (reach, reach), (-reach, reach)):
@@ -236,18 +231,19 @@ def _patch_inside(
     return ok
 
 
-def _fixed_patches(image: _Float, centres: NDArray[np.int64], reach: int) -> _Float:
+def _fixed_patches(image: _Float, centres: Array, reach: int) -> _Float:
     """(n, s, s) patches at whole pixels."""
     windows = np.lib.stride_tricks.sliding_window_view(image, (2 * reach + 1, 2 * reach + 1))
-    return np.asarray(windows[centres[:, 1] - reach, centres[:, 0] - reach])
+    column, row = centres.astype(np.int64).T - reach
+    return np.asarray(windows[row, column])
 
 
-def _moving_patches(image: _Float, moving_from_fixed: Array, centres: NDArray[np.int64], reach: int) -> _Float:
+def _moving_patches(image: _Float, moving_from_fixed: Array, centres: Array, reach: int) -> _Float:
     """(n, s, s) patches of the moving picture on the pixel grid of the fixed one, bilinear."""
     side = 2 * reach + 1
     offset = np.arange(-reach, reach + 1, dtype=np.float64)
-    x = (centres[:, 0, None, None] + offset[None, None, :]).astype(np.float64)
-    y = (centres[:, 1, None, None] + offset[None, :, None]).astype(np.float64)
+    x = centres[:, 0, None, None] + offset[None, None, :]
+    y = centres[:, 1, None, None] + offset[None, :, None]
     t = moving_from_fixed
     w = t[2, 0] * x + t[2, 1] * y + t[2, 2]
     map_x = ((t[0, 0] * x + t[0, 1] * y + t[0, 2]) / w).astype(np.float32)
@@ -257,8 +253,11 @@ def _moving_patches(image: _Float, moving_from_fixed: Array, centres: NDArray[np
     per_sheet = max(1, 8000 // side)
     sheets = [
         cv2.remap(
-            image, map_x[i : i + per_sheet].reshape(-1, side), map_y[i : i + per_sheet].reshape(-1, side),
-            cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
+            image,
+            map_x[i : i + per_sheet].reshape(-1, side),
+            map_y[i : i + per_sheet].reshape(-1, side),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
         )
         for i in range(0, n, per_sheet)
     ]
@@ -340,4 +339,4 @@ def _contradicts(model: Model, consensus: Consensus, transform: Array, matched: 
 
     freedom = model.degrees_of_freedom
     rise = (cost(transform) / max(cost(consensus.dst_from_src), 1e-12) - 1.0) * max(2 * len(pairs) - freedom, 1)
-    return rise > freedom + 6.0 * np.sqrt(2.0 * freedom)
+    return bool(rise > freedom + 6.0 * np.sqrt(2.0 * freedom))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from autoalign.geometry.chance import disc_chance, first_in_each_cell, log10_false_alarms
 from autoalign.geometry.family import MODELS, ModelName
@@ -85,8 +86,13 @@ def significant(pairs: Correspondences, consensus: Consensus, sizes: Sizes, opti
 
 
 def weigh(
-    model: ModelName, transform: Array, pairs: Correspondences, consensus: Consensus, fitted: Correspondences,
-    agreed: Agreement, sizes: Sizes,
+    model: ModelName,
+    transform: Array,
+    pairs: Correspondences,
+    consensus: Consensus,
+    fitted: Correspondences,
+    agreed: Agreement,
+    sizes: Sizes,
 ) -> Evidence:
     """Collect the evidence for a transform of the model `model`, fixed from moving.
 
@@ -117,10 +123,10 @@ def _root_mean_square(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("inf")
 
 
-def _independent(pairs: Correspondences) -> Array:
+def _independent(pairs: Correspondences) -> NDArray[np.int64]:
     """Indices of the matches that repeat no better one's spot, in either picture."""
     by_dst = first_in_each_cell(pairs.dst / pairs.dst_sigma.mean(), _SPOT_SIGMAS)
-    return by_dst[first_in_each_cell(pairs.src[by_dst] / pairs.src_sigma.mean(), _SPOT_SIGMAS)]
+    return np.asarray(by_dst[first_in_each_cell(pairs.src[by_dst] / pairs.src_sigma.mean(), _SPOT_SIGMAS)])
 
 
 def _log10_false_alarms(independent: Correspondences, consensus: Consensus, sizes: Sizes) -> float:
@@ -210,23 +216,33 @@ def _rejections(evidence: Evidence, options: VerdictOptions) -> list[tuple[str, 
     least, greatest = evidence.stretch
     found = []
     if evidence.log10_false_alarms > options.max_log10_false_alarms:
-        found.append((
-            f"{_agree(evidence)}, which chance explains ({_chance(evidence.log10_false_alarms)}; "
-            f"{_chance(options.max_log10_false_alarms)} needed)",
-            "the pictures may show different things; --effort max looks harder",
-        ))
-    if evidence.anisotropy > options.max_anisotropy or greatest > options.max_stretch or least < 1 / options.max_stretch:
-        found.append((
-            f"{_agree(evidence)}, but on a transform that no camera makes (scales {least:.2g} to {greatest:.2g})",
-            "a simpler --model may hold",
-        ))
+        found.append(
+            (
+                f"{_agree(evidence)}, which chance explains ({_chance(evidence.log10_false_alarms)}; "
+                f"{_chance(options.max_log10_false_alarms)} needed)",
+                "the pictures may show different things; --effort max looks harder",
+            )
+        )
+    if (
+        evidence.anisotropy > options.max_anisotropy
+        or greatest > options.max_stretch
+        or least < 1 / options.max_stretch
+    ):
+        found.append(
+            (
+                f"{_agree(evidence)}, but on a transform that no camera makes (scales {least:.2g} to {greatest:.2g})",
+                "a simpler --model may hold",
+            )
+        )
     if evidence.overlap < options.min_overlap:
         found.append((f"{_agree(evidence)}, but the pictures overlap by only {evidence.overlap:.1%}", ""))
     if evidence.agreement.share < options.min_agreement:
-        found.append((
-            f"{_agree(evidence)}, but only {_blocks(evidence)}: what they share is a small part, as a caption or logo is",
-            "mask what the pictures share but do not show (--fixed-mask, --moving-mask)",
-        ))
+        found.append(
+            (
+                f"{_agree(evidence)}, but only {_blocks(evidence)}: what they share is a small part, as a caption or logo is",
+                "mask what the pictures share but do not show (--fixed-mask, --moving-mask)",
+            )
+        )
     return found
 
 
@@ -241,10 +257,12 @@ def _doubts(
     if evidence.agreement.share < options.sure_agreement:
         found.append((f"{_agree(evidence)}, but only {_blocks(evidence)}", "look at the overlay"))
     if error > limit:
-        found.append((
-            f"{_agree(evidence)}, but they leave the transform open to {error:.1f} px",
-            "look at the overlay; a simpler --model is steadier far from the matches",
-        ))
+        found.append(
+            (
+                f"{_agree(evidence)}, but they leave the transform open to {error:.1f} px",
+                "look at the overlay; a simpler --model is steadier far from the matches",
+            )
+        )
     return found
 
 
@@ -264,7 +282,9 @@ def judge_typed(transform: Array, pairs: Correspondences, options: VerdictOption
     anisotropy = _shape(transform, overlap_points(transform, sizes.moving, sizes.fixed))[1]
     limit = max(options.max_expected_error_px, options.max_expected_error_share * float(np.hypot(*sizes.fixed)))
     if not np.isfinite(anisotropy):
-        return unfit_points(f"the {len(pairs)} typed points give a transform that folds or mirrors the picture, or misses it")
+        return unfit_points(
+            f"the {len(pairs)} typed points give a transform that folds or mirrors the picture, or misses it"
+        )
     if error > limit:
         reason = f"the {len(pairs)} typed points are off their transform by {error:.1f} px (root mean square)"
         return Verdict(status="doubtful", reason=reason, advice="look for a mistyped point", expected_error_px=error)
