@@ -27,11 +27,16 @@ _GLANCE = 100  # matches that a hypothesis is first judged by
 class RansacOptions:
     """How the consensus is searched."""
 
-    threshold: float = 3.0  # a match agrees if its symmetric transfer error is under so many sigmas
-    confidence: float = 0.999  # stop when a larger consensus is this improbable to have been missed
-    max_trials: int = 20_000  # samples at most
-    batch: int = 500  # samples drawn and judged together
-    seed: int = 0  # of the one random generator
+    threshold: float = 3.0
+    """a match agrees if its symmetric transfer error is under so many sigmas"""
+    confidence: float = 0.999
+    """stop when a larger consensus is this improbable to have been missed"""
+    max_trials: int = 20_000
+    """samples at most"""
+    batch: int = 500
+    """samples drawn and judged together"""
+    seed: int = 0
+    """of the one random generator"""
 
     def __post_init__(self) -> None:
         if not (self.threshold > 0 and 0 < self.confidence < 1 and self.max_trials > 0 and self.batch > 0):

@@ -29,11 +29,16 @@ _SIFT_NORM = 4000.0  # a RootSIFT descriptor of this length, rounded: its scalar
 class FeatureOptions:
     """What to look for in a picture, and at which size."""
 
-    detector: Detector = "sift"  # sift finds more under blur and turns of view, orb is ten times faster
-    working_pixels: float = 1e6  # larger pictures are shrunken to this many pixels
-    max_features: int = 4000  # kept, spread over the picture
-    contrast: float = 0.02  # sift: least contrast of a keypoint (0.04 is OpenCV's default)
-    root: bool = True  # sift: compare square roots of the histograms (RootSIFT)
+    detector: Detector = "sift"
+    """sift finds more under blur and turns of view, orb is ten times faster"""
+    working_pixels: float = 1e6
+    """larger pictures are shrunken to this many pixels"""
+    max_features: int = 4000
+    """kept, spread over the picture"""
+    contrast: float = 0.02
+    """sift: least contrast of a keypoint (0.04 is OpenCV's default)"""
+    root: bool = True
+    """sift: compare square roots of the histograms (RootSIFT)"""
 
     def __post_init__(self) -> None:
         if self.detector not in DETECTORS or self.working_pixels < 1 or self.max_features < 1 or self.contrast <= 0:

@@ -20,8 +20,10 @@ from autoalign.registration.features import Features
 class MatchOptions:
     """Which pairs of descriptors count as a match."""
 
-    ratio: float = 0.85  # nearest over second nearest distance, at most
-    apart: float = 0.5  # neighbours nearer than this many keypoint diameters to the nearest one do not rival it
+    ratio: float = 0.85
+    """nearest over second nearest distance, at most"""
+    apart: float = 0.5
+    """neighbours nearer than this many keypoint diameters to the nearest one do not rival it"""
 
     def __post_init__(self) -> None:
         if not (0 < self.ratio <= 1 and self.apart >= 0):

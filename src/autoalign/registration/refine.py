@@ -43,11 +43,16 @@ _Float = NDArray[np.float32]
 class RefineOptions:
     """How the transform is sharpened on the pixels."""
 
-    patches: int = 1500  # at most; 0 leaves the transform of the keypoints as it is
-    radius: int = 12  # a patch is 2 x radius + 1 pixels wide
-    rounds: int = 3  # on the full pictures
-    min_correlation: float = 0.6  # a patch takes part if its normalised correlation is above
-    max_shift: float = 2.0  # px; a patch that wants to move further is dropped
+    patches: int = 1500
+    """at most; 0 leaves the transform of the keypoints as it is"""
+    radius: int = 12
+    """a patch is 2 x radius + 1 pixels wide"""
+    rounds: int = 3
+    """on the full pictures"""
+    min_correlation: float = 0.6
+    """a patch takes part if its normalised correlation is above"""
+    max_shift: float = 2.0
+    """px; a patch that wants to move further is dropped"""
 
     def __post_init__(self) -> None:
         if self.patches < 0 or self.radius < 3 or self.rounds < 1 or not 0 < self.min_correlation < 1:

@@ -30,15 +30,24 @@ _SPOT_SIGMAS = 5.0  # matches nearer than this are one observation
 class VerdictOptions:
     """What is asked of the evidence before it counts."""
 
-    max_log10_false_alarms: float = -4.0  # of the consensus: random matches agree as well with a chance of 1 in 10^4
-    sure_log10_false_alarms: float = -12.0  # above, the pixels must agree more clearly
-    min_agreement: float = 0.25  # share of the blocks of the overlap that agree; 0.05 do by chance
-    sure_agreement: float = 0.4  # below, the pair is doubtful
-    max_expected_error_px: float = 3.0  # above, and above max_expected_error_share, the pair is doubtful
-    max_expected_error_share: float = 0.005  # of the diagonal of the fixed picture
-    max_stretch: float = 20.0  # largest change of scale, either way, that a camera makes
-    max_anisotropy: float = 12.0  # largest ratio of the two scales at a point
-    min_overlap: float = 0.01  # share of the smaller picture
+    max_log10_false_alarms: float = -4.0
+    """of the consensus: random matches agree as well with a chance of 1 in 10^4"""
+    sure_log10_false_alarms: float = -12.0
+    """above, the pixels must agree more clearly"""
+    min_agreement: float = 0.25
+    """share of the blocks of the overlap that agree; 0.05 do by chance"""
+    sure_agreement: float = 0.4
+    """below, the pair is doubtful"""
+    max_expected_error_px: float = 3.0
+    """above, and above max_expected_error_share, the pair is doubtful"""
+    max_expected_error_share: float = 0.005
+    """of the diagonal of the fixed picture"""
+    max_stretch: float = 20.0
+    """largest change of scale, either way, that a camera makes"""
+    max_anisotropy: float = 12.0
+    """largest ratio of the two scales at a point"""
+    min_overlap: float = 0.01
+    """share of the smaller picture"""
 
     def __post_init__(self) -> None:
         if self.max_expected_error_px <= 0 or self.max_stretch <= 1 or not 0 <= self.min_agreement <= 1:
