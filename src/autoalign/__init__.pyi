@@ -1,0 +1,35 @@
+from .errors import AlignmentError as AlignmentError
+from .errors import AutoalignError as AutoalignError
+from .errors import CanvasError as CanvasError
+from .errors import ImageReadError as ImageReadError
+from .errors import ImageWriteError as ImageWriteError
+from .files.points import read_points as read_points
+from .files.points import write_points as write_points
+from .files.read import read_picture as read_picture
+from .files.sidecar import Sidecar as Sidecar
+from .files.sidecar import read_sidecar as read_sidecar
+from .files.sidecar import write_sidecar as write_sidecar
+from .files.write import write_picture as write_picture
+from .geometry.family import fit as fit
+from .geometry.homography import apply as apply
+from .geometry.homography import invert as invert
+from .geometry.ransac import RansacOptions as RansacOptions
+from .geometry.ransac import ransac as ransac
+from .picture.canvas import canvas as canvas
+from .picture.canvas import plane_canvas as plane_canvas
+from .picture.compose import compose as compose
+from .picture.warp import warp as warp
+from .registration.align import Alignment as Alignment
+from .registration.align import AlignOptions as AlignOptions
+from .registration.align import align as align
+from .registration.align import align_points as align_points
+from .registration.features import FeatureOptions as FeatureOptions
+from .registration.features import detect as detect
+from .registration.matching import MatchOptions as MatchOptions
+from .registration.matching import match as match
+from .registration.onto_fixed import warp_onto_fixed as warp_onto_fixed
+from .registration.refine import RefineOptions as RefineOptions
+from .registration.refine import refine as refine
+from .registration.verdict import VerdictOptions as VerdictOptions
+
+__version__: str

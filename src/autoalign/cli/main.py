@@ -1,0 +1,111 @@
+"""The program: its commands, and what becomes of every error.
+
+Commands are imported when they are called, so that `autoalign --help` waits for no picture library.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError, Parameter
+
+from autoalign import __version__
+from autoalign.cli import settings
+from autoalign.cli.terminal import Exit, complain
+from autoalign.errors import AlignmentError, CanvasError, ImageReadError, ImageWriteError
+
+COMMANDS = {
+    "pair": """\
+Put MOVING onto FIXED, which stays as it is.
+
+Says in one line how it went. An aligned pair gives the picture and its record. A doubtful one gives the record, from \
+which `autoalign apply` makes the picture once you have looked, and the overlay if you ask for one. A rejected one \
+gives the record only, with the reason.
+
+Exit code: 0 aligned, 1 doubtful or rejected, 2 wrong usage, 3 a file could not be read or written.
+""",
+    "rectify": """\
+Show a plane in IMAGE upright and to scale, from four or more points on it.
+
+IMAGE stays as it is. Ground that is far away, towards the horizon of the plane, is cropped, and this is said.
+
+Exit code: 0 done, 1 no canvas can hold it, 2 wrong usage, 3 a file could not be read or written.
+""",
+    "apply": """\
+Put other pictures or points through a transform that `autoalign pair` saved.
+
+The pictures must have the size of the MOVING picture of that pair: its mask, another channel, its neighbour in a \
+burst. They stay as they are; the results lie on FIXED. A doubtful pair is applied without a question.
+
+Exit code: 0 done, 1 the pair was rejected, 2 wrong usage, 3 a file could not be read or written.
+""",
+}
+"""Command to help text, whose first line `autoalign --help` shows; each lives in the module of its name."""
+
+USAGE = {"apply": "Usage: autoalign apply [OPTIONS] SIDECAR [IMAGES...]"}  # what cannot be told from the signature
+
+EPILOGUE = """\
+Every option can also be set as AUTOALIGN_<OPTION> in the environment or in an autoalign.toml here or in a folder \
+above. The command line wins over the environment, and the environment over the file.
+"""
+
+
+def _shown_default(value: object) -> str | None:
+    """Flags are off and paths are absent unless given: saying so for each would only make the help longer."""
+    return None if value is None or value is False else str(value)
+
+
+app = App(
+    name="autoalign",
+    help="Put one picture onto another, without hands, and say when it cannot be done.",
+    help_format="plaintext",
+    help_epilogue=EPILOGUE,
+    version=f"autoalign {__version__}",
+    version_format="plaintext",
+    default_parameter=Parameter(negative=(), show_default=_shown_default),
+    config=(settings.environment, settings.file),
+    suppress_keyboard_interrupt=False,
+)
+for position, (name, text) in enumerate(COMMANDS.items()):
+    app.command(f"autoalign.cli.{name}:{name}", name=name, help=text, sort_key=position, usage=USAGE.get(name))
+app.register_install_completion_command(help="Install completion for this shell and exit.")
+
+EXIT_OF: dict[type[BaseException], Exit] = {
+    KeyboardInterrupt: Exit.INTERRUPTED,
+    AlignmentError: Exit.NOT_ALIGNED,
+    CanvasError: Exit.NOT_ALIGNED,
+    MemoryError: Exit.NOT_ALIGNED,
+    ImageReadError: Exit.FILE,
+    ImageWriteError: Exit.FILE,
+    OSError: Exit.FILE,  # the terminal or the pipe behind stdout is gone or full
+    CycloptsError: Exit.USAGE,
+    ValueError: Exit.USAGE,
+}
+
+
+def main(tokens: Sequence[str] | None = None) -> int:
+    """Run one command line, by default this process's, and return its exit code."""
+    tokens = sys.argv[1:] if tokens is None else tokens
+    try:
+        done: Exit | None = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+        sys.stdout.flush()
+        return Exit.DONE if done is None else done
+    except (Exception, KeyboardInterrupt) as error:
+        code = next((code for kind, code in EXIT_OF.items() if isinstance(error, kind)), Exit.BUG)
+        # A wrong call is a ValueError, and so is many a fault in a library: -v tells them apart.
+        if isinstance(error, ValueError) or code == Exit.BUG:
+            _trace(tokens)
+        reason = str(error) or type(error).__name__
+        complain(reason if code != Exit.BUG else f"this is a bug ({type(error).__name__}: {reason}); -v shows where")
+        return code
+
+
+def _trace(tokens: Sequence[str]) -> None:
+    if not {"-v", "--verbose"}.isdisjoint(tokens):
+        traceback.print_exc()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

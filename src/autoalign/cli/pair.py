@@ -1,0 +1,176 @@
+"""`autoalign pair`: one picture onto another."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import numpy as np
+from cyclopts import Group, Parameter
+from numpy.typing import NDArray
+
+from autoalign.cli.outputs import SCREEN_PIXEL, check_outputs
+from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
+from autoalign.files.points import CORRESPONDENCES, read_points
+from autoalign.files.read import LoadedPicture, read_picture
+from autoalign.files.record import record
+from autoalign.files.sidecar import Sidecar, default_sidecar, write_sidecar
+from autoalign.files.write import default_output, write_picture
+from autoalign.geometry.ransac import RansacOptions
+from autoalign.picture.canvas import CanvasKind, canvas
+from autoalign.picture.compose import STYLES, compose
+from autoalign.picture.pixels import grey, size_of
+from autoalign.picture.warp import warp
+from autoalign.registration.align import Alignment, AlignOptions, align, align_points
+from autoalign.registration.refine import RefineOptions
+from autoalign.registration.verdict import VerdictOptions
+
+# One flag per field of every stage, under the field's own name and a heading of the stage's.
+for stage, heading in ((RansacOptions, "Consensus"), (RefineOptions, "Refinement"), (VerdictOptions, "Verdict")):
+    Parameter(name="*", group=Group(heading, sort_key=3))(stage)
+
+STDOUT = Path("-")
+STYLE_OF = {"aligned": "bold green", "doubtful": "bold yellow", "rejected": "bold red"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairFiles:
+    """What `pair` reads beside the two pictures, and what it writes."""
+
+    output: Annotated[Path | None, Parameter(alias="-o")] = None
+    """the aligned picture; by default <MOVING>_aligned<ext> beside MOVING"""
+    canvas: CanvasKind = "fixed"
+    """frame of the aligned picture: FIXED's own, one that holds both, or one that holds all of MOVING as it lies"""
+    overlay: Path | None = None
+    """also write both pictures as one, to look at"""
+    overlay_style: Annotated[str, Parameter(choices=tuple(STYLES))] = "mean"
+    """how the overlay shows the two"""
+    json: Annotated[Path | None, Parameter(allow_leading_hyphen=True)] = None
+    """the record of the alignment, - for stdout; by default <output stem>.autoalign.json beside the output"""
+    timings: bool = False
+    """put the seconds of every stage into the record, which then differs from run to run"""
+    points: Path | None = None
+    """take these correspondences, and look for none: CSV with the columns fixed_x, fixed_y, moving_x, moving_y"""
+    fixed_mask: Path | None = None
+    """picture of FIXED's size that is not black where FIXED is to be ignored"""
+    moving_mask: Path | None = None
+    """picture of MOVING's size that is not black where MOVING is to be ignored"""
+
+
+def pair(
+    fixed: Path,
+    moving: Path,
+    /,
+    *,
+    files: Annotated[PairFiles, Parameter(name="*", group=FILES)] = PairFiles(),
+    options: Annotated[AlignOptions, Parameter(name="*", group=Group("Alignment", sort_key=2))] = AlignOptions(),
+    common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
+) -> int:
+    """Align, draw, keep the record, say how it went.
+
+    Parameters
+    ----------
+    fixed
+        the picture that stays
+    moving
+        the picture that is put onto it
+    """
+    started = time.perf_counter()
+    still, mover = read_picture(fixed), read_picture(moving)
+    output = files.output or default_output(moving, mover.pixels)
+    sidecar = None if files.json == STDOUT else files.json or default_sidecar(output)
+    check_outputs(
+        [(output, mover.pixels), (files.overlay, SCREEN_PIXEL), (sidecar, None)],
+        inputs=[fixed, moving, files.points, files.fixed_mask, files.moving_mask],
+        overwrite=common.overwrite,
+    )
+    alignment = _align(still, mover, files, options)
+    written = _draw(alignment, still, mover, files, output, common.overwrite)
+    kept = record(alignment, still, mover, drawn={"canvas": files.canvas}, timings=files.timings)
+    if sidecar is None:
+        sys.stdout.write(_sidecar_text(kept))
+    else:
+        write_sidecar(sidecar, kept, common.overwrite)
+        written.append(sidecar)
+    if common.verbose:
+        _tell_stages(alignment)
+    if not common.quiet:
+        line = verdict_line(alignment, time.perf_counter() - started)
+        tell(line, style=STYLE_OF[alignment.status], to_stderr=sidecar is None)
+    if alignment.verdict.advice:
+        note(f"what may help: {alignment.verdict.advice}", common)
+    if written:
+        note(f"wrote {', '.join(map(str, written))}", common)
+    return Exit.DONE if alignment.status == "aligned" else Exit.NOT_ALIGNED
+
+
+def verdict_line(alignment: Alignment, seconds: float) -> str:
+    """The status and its numbers, and the reason where the pair is not aligned."""
+    if alignment.status == "rejected":
+        return f"rejected: {alignment.reason} ({seconds:.1f} s)"
+    numbers = [f"{alignment.inliers:,} of {alignment.matches:,} matches agree"]
+    if alignment.expected_error_px is not None:
+        numbers.append(f"expected error {alignment.expected_error_px:.2f} px")
+    numbers += [f"overlap {alignment.overlap:.0%}", f"{seconds:.1f} s"]
+    why = f": {alignment.reason}" if alignment.status == "doubtful" else ""
+    return f"{alignment.status}: {', '.join(numbers)}{why}"
+
+
+def _sidecar_text(sidecar: Sidecar) -> str:
+    """What `write_sidecar` would put into a file."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "sidecar.json"
+        write_sidecar(path, sidecar)
+        return path.read_text()
+
+
+def _align(fixed: LoadedPicture, moving: LoadedPicture, files: PairFiles, options: AlignOptions) -> Alignment:
+    if files.points is None:
+        masks = {"fixed_valid": _usable(files.fixed_mask), "moving_valid": _usable(files.moving_mask)}
+        return align(fixed.pixels, moving.pixels, options, **masks)
+    if files.fixed_mask or files.moving_mask:
+        raise ValueError("--points leaves nothing to look for, so that a mask has no use")
+    points = read_points(files.points, CORRESPONDENCES)
+    return align_points(points[:, :2], points[:, 2:], size_of(fixed.pixels), size_of(moving.pixels), options)
+
+
+def _usable(mask: Path | None) -> NDArray[np.bool_] | None:
+    """(h, w) True where the mask is black, that is, where nothing is to be ignored."""
+    return None if mask is None else grey(read_picture(mask).pixels) == 0
+
+
+def _draw(
+    alignment: Alignment,
+    fixed: LoadedPicture,
+    moving: LoadedPicture,
+    files: PairFiles,
+    output: Path,
+    overwrite: bool,
+) -> list[Path]:
+    """Write the picture of an aligned pair and the overlay of one that is not rejected; the files written."""
+    written: list[Path] = []
+    if alignment.status == "rejected":
+        return written
+    transform = alignment.fixed_from_moving
+    frame = canvas(files.canvas, size_of(fixed.pixels), size_of(moving.pixels), transform)
+    moved = warp(moving.pixels, frame.size, frame.canvas_from_fixed @ transform)
+    if alignment.status == "aligned":
+        write_picture(output, moved.pixels, moving.metadata, overwrite=overwrite)
+        written.append(output)
+    if files.overlay is not None:
+        still = warp(fixed.pixels, frame.size, frame.canvas_from_fixed)
+        both = compose(files.overlay_style, still.pixels, moved.pixels, still.valid, moved.valid)
+        write_picture(files.overlay, both, overwrite=overwrite)
+        written.append(files.overlay)
+    return written
+
+
+def _tell_stages(alignment: Alignment) -> None:
+    for name, found in alignment.counts().items():
+        tell(f"{name.replace('_', ' ')}: {found}", to_stderr=True)
+    for stage, seconds in alignment.seconds.items():
+        tell(f"{stage}: {seconds:.2f} s", to_stderr=True)

@@ -1,0 +1,70 @@
+"""An Alignment and the two files it came from -> the Sidecar that is kept of it."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import cv2
+import numpy as np
+
+from autoalign import __version__
+from autoalign.files.read import LoadedPicture
+from autoalign.files.sidecar import PictureRecord, Sidecar, as_shown
+from autoalign.picture.pixels import size_of
+from autoalign.registration.align import Alignment
+
+
+def record(
+    alignment: Alignment,
+    fixed: LoadedPicture,
+    moving: LoadedPicture,
+    *,
+    drawn: Mapping[str, Any] | None = None,
+    timings: bool = False,
+) -> Sidecar:
+    """All that is kept of an alignment of two files; the same for the same pair unless `timings` are asked for.
+
+    `drawn` are the options that say how the result is drawn; they stand beside those of the alignment.
+    """
+    rejected = alignment.status == "rejected"
+    return Sidecar(
+        status=alignment.status,
+        reason=alignment.reason,
+        fixed_from_moving=None if rejected else as_shown(alignment.fixed_from_moving),
+        expected_error_px=alignment.expected_error_px,
+        model=alignment.model,
+        fixed=_picture(fixed),
+        moving=_picture(moving),
+        options=asdict(alignment.options) | dict(drawn or {}),
+        versions=versions(),
+        stages=alignment.counts(),
+        evidence={name: _finite(value) for name, value in alignment.evidence().items()},
+        timings_s=alignment.seconds if timings else None,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Of everything that has a part in the numbers."""
+    return {
+        "autoalign": __version__,
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """The value with None for every number that is not finite, for which JSON has no word."""
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _picture(loaded: LoadedPicture) -> PictureRecord:
+    return PictureRecord(name=loaded.path.name, size=size_of(loaded.pixels), sha256=loaded.sha256)
