@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from autoalign.geometry.homography import Array
 from autoalign.registration.features import Features
 
+_ROWS = 1024  # descriptors compared at a time
+
 
 @dataclass(frozen=True, kw_only=True)
 class MatchOptions:
@@ -49,11 +51,12 @@ def match(fixed: Features, moving: Features, options: MatchOptions | None = None
         raise ValueError(f"features of {fixed.detector} cannot match features of {moving.detector}")
     if len(fixed) < 2 or len(moving) < 2:
         return Matches(fixed_index=np.zeros(0, np.int64), moving_index=np.zeros(0, np.int64), ratio=np.zeros(0))
-    distance = _squared_distances(fixed.descriptors, moving.descriptors)
-    i, j, nearest = _mutual(distance)
-    rival = np.minimum(
-        _second(distance[i], j, moving, options.apart), _second(distance[:, j].T, i, fixed, options.apart)
-    )
+    j, nearest, rival, least = _nearest(fixed.descriptors, moving, options.apart)
+    # Mutual: no other row is nearer to the column. Then the rivals of the few pairs that are left, the other way round.
+    i = np.flatnonzero((nearest == least[j]) & (nearest <= options.ratio**2 * rival))
+    i = i[np.sort(np.unique(j[i], return_index=True)[1])]  # equal descriptors: the first keeps the partner
+    j, nearest, rival = j[i], nearest[i], rival[i]
+    rival = np.minimum(rival, _nearest(moving.descriptors[j], fixed, options.apart)[2])
     ratio = np.sqrt(nearest / np.maximum(rival, 1e-12))
     good = np.flatnonzero(ratio <= options.ratio)
     order = good[np.lexsort((i[good], ratio[good]))]
@@ -61,45 +64,55 @@ def match(fixed: Features, moving: Features, options: MatchOptions | None = None
     return Matches(fixed_index=i[order], moving_index=j[order], ratio=ratio[order].astype(np.float64))
 
 
-def _squared_distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n, m) squared Euclidean distances of (n, d) and (m, d)."""
+def _nearest(
+    descriptors: NDArray[np.float32], others: Features, apart: float
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """For each of (n, d) descriptors the nearest of the others (n,), its squared distance (n,), that of its nearest rival
+    (n,), and for each of the m others the least distance to any descriptor (m,)."""
+    n = len(descriptors)
+    index, near, rival = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
+    least = np.full(len(others), np.inf, np.float32)
+    lengths = (others.descriptors * others.descriptors).sum(1)
+    for start in range(0, n, _ROWS):  # blocks of rows bound the memory
+        rows = slice(start, start + _ROWS)
+        distance = _squared_distances(descriptors[rows], others.descriptors, lengths)
+        np.minimum(least, distance.min(0), out=least)
+        index[rows] = distance.argmin(1)
+        near[rows] = distance[np.arange(len(distance)), index[rows]]
+        rival[rows] = _second(distance, index[rows], others, apart)
+    return index, near, rival, least
+
+
+def _squared_distances(
+    a: NDArray[np.float32], b: NDArray[np.float32], b_lengths: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """(n, m) squared Euclidean distances of (n, d) and (m, d), whose own squared lengths (m,) are known."""
     product = a @ b.T
     product *= -2
     product += (a * a).sum(1)[:, None]
-    product += (b * b).sum(1)
+    product += b_lengths
     return np.asarray(np.maximum(product, 0, out=product))
-
-
-def _mutual(distance: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Rows, columns and distances of the mutual nearest neighbours."""
-    column = distance.argmin(1)
-    rows = np.arange(len(distance))
-    nearest = distance[rows, column]
-    mutual = nearest == distance.min(0)[column]
-    i, j = rows[mutual], column[mutual]
-    # Equal descriptors may give two rows to one column: the first keeps it.
-    _, first = np.unique(j, return_index=True)
-    return i[first], j[first], nearest[mutual][first]
 
 
 def _second(
     distance: NDArray[np.float32], nearest: NDArray[np.int64], others: Features, apart: float
 ) -> NDArray[np.float32]:
-    """(k,) distance of the nearest of `others` that is not the point `nearest` (k,) seen again; `distance` is (k, m).
+    """(n,) distance of the nearest of `others` that is not the point `nearest` (n,) seen again; spoils `distance`.
 
     One point of the scene is often found twice, at two scales or with two orientations; such a twin is no rival.
     """
-    distance = distance.copy()
     rows = np.arange(len(distance))
     distance[rows, nearest] = np.inf
+    rival = np.empty(len(distance), np.float32)
     reach = (apart * others.sizes[nearest]) ** 2
-    while True:
-        second = distance.argmin(1)
-        gap = ((others.points[second] - others.points[nearest]) ** 2).sum(1)
-        twin = (gap < reach) & np.isfinite(distance[rows, second])
-        if not twin.any():
-            return np.asarray(distance[rows, second])
-        distance[rows[twin], second[twin]] = np.inf
+    while len(rows):
+        second = distance[rows].argmin(1)
+        rival[rows] = distance[rows, second]
+        gap = ((others.points[second] - others.points[nearest[rows]]) ** 2).sum(1)
+        twin = (gap < reach[rows]) & np.isfinite(rival[rows])
+        rows, second = rows[twin], second[twin]
+        distance[rows, second] = np.inf
+    return rival
 
 
 def _first_at_its_place(fixed: Array, moving: Array) -> NDArray[np.int64]:
