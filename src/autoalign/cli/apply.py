@@ -9,16 +9,14 @@ from typing import Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from autoalign.cli.outputs import check_outputs
+from autoalign.cli.files import check_outputs, read_sized
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, complain, note
 from autoalign.errors import ImageReadError, ImageWriteError
 from autoalign.files.points import POSITIONS, read_points, write_points
-from autoalign.files.read import read_picture
 from autoalign.files.sidecar import Sidecar, read_sidecar, transform_of
 from autoalign.files.write import default_output, write_picture
 from autoalign.geometry.homography import invert, project
 from autoalign.picture.canvas import CanvasKind, canvas
-from autoalign.picture.pixels import size_of
 from autoalign.picture.warp import Interpolation, warp
 
 
@@ -86,12 +84,8 @@ def _output(image: Path, options: ApplyOptions) -> Path:
 
 def _put(record: Sidecar, image: Path, output: Path, options: ApplyOptions, common: Common) -> None:
     """One picture through the transform."""
-    loaded = read_picture(image)
-    size, moving_size = size_of(loaded.pixels), record.moving.size
-    if size != moving_size:
-        raise ImageReadError(
-            "is {} x {}, and the transform is for pictures of {} x {}: {}".format(*size, *moving_size, image)
-        )
+    moving_size = record.moving.size
+    loaded = read_sized(image, moving_size)
     transform = transform_of(record)
     frame = canvas(options.canvas or record.options.get("canvas", "fixed"), record.fixed.size, moving_size, transform)
     moved = warp(loaded.pixels, frame.size, frame.canvas_from_fixed @ transform, interpolation=options.interpolation)

@@ -1,4 +1,4 @@
-"""The files that a command will write, refused before any work is done."""
+"""The files that a command reads and writes, refused before any work is done."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from autoalign.errors import ImageReadError
+from autoalign.files.read import LoadedPicture, read_picture
 from autoalign.files.write import check_format, check_writable
-from autoalign.picture.pixels import Picture
+from autoalign.picture.pixels import Picture, size_of
 
 SCREEN_PIXEL: Picture = np.zeros((1, 1, 3), np.uint8)
 """What a picture made for the eye is made of."""
@@ -32,3 +34,12 @@ def check_outputs(
         if pixels is not None:
             check_format(path, pixels)
         check_writable(path, overwrite)
+
+
+def read_sized(path: Path, size: tuple[int, int]) -> LoadedPicture:
+    """Read a picture that must be of `size` (w, h). Raises ImageReadError, the path last."""
+    loaded = read_picture(path)
+    if size_of(loaded.pixels) != size:
+        (w, h), (wanted_w, wanted_h) = size_of(loaded.pixels), size
+        raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {path}")
+    return loaded

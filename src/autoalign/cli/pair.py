@@ -13,7 +13,7 @@ import numpy as np
 from cyclopts import Group, Parameter
 from numpy.typing import NDArray
 
-from autoalign.cli.outputs import SCREEN_PIXEL, check_outputs
+from autoalign.cli.files import SCREEN_PIXEL, check_outputs, read_sized
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
 from autoalign.files.points import CORRESPONDENCES, read_points
 from autoalign.files.read import LoadedPicture, read_picture
@@ -112,10 +112,13 @@ def verdict_line(alignment: Alignment, seconds: float) -> str:
     """The status and its numbers, and the reason where the pair is not aligned."""
     if alignment.status == "rejected":
         return f"rejected: {alignment.reason} ({seconds:.1f} s)"
-    numbers = [f"{alignment.inliers:,} of {alignment.matches:,} matches agree"]
+    found = f"{alignment.inliers:,} of {alignment.matches:,} matches agree"
+    numbers = [found if alignment.best.consensus else f"{alignment.matches} typed points"]
     if alignment.expected_error_px is not None:
         numbers.append(f"expected error {alignment.expected_error_px:.2f} px")
-    numbers += [f"overlap {alignment.overlap:.0%}", f"{seconds:.1f} s"]
+    if alignment.best.evidence:
+        numbers.append(f"overlap {alignment.overlap:.0%}")
+    numbers.append(f"{seconds:.1f} s")
     why = f": {alignment.reason}" if alignment.status == "doubtful" else ""
     return f"{alignment.status}: {', '.join(numbers)}{why}"
 
@@ -130,17 +133,17 @@ def _sidecar_text(sidecar: Sidecar) -> str:
 
 def _align(fixed: LoadedPicture, moving: LoadedPicture, files: PairFiles, options: AlignOptions) -> Alignment:
     if files.points is None:
-        masks = {"fixed_valid": _usable(files.fixed_mask), "moving_valid": _usable(files.moving_mask)}
-        return align(fixed.pixels, moving.pixels, options, **masks)
+        fixed_valid, moving_valid = _usable(files.fixed_mask, fixed), _usable(files.moving_mask, moving)
+        return align(fixed.pixels, moving.pixels, options, fixed_valid=fixed_valid, moving_valid=moving_valid)
     if files.fixed_mask or files.moving_mask:
         raise ValueError("--points leaves nothing to look for, so that a mask has no use")
     points = read_points(files.points, CORRESPONDENCES)
     return align_points(points[:, :2], points[:, 2:], size_of(fixed.pixels), size_of(moving.pixels), options)
 
 
-def _usable(mask: Path | None) -> NDArray[np.bool_] | None:
-    """(h, w) True where the mask is black, that is, where nothing is to be ignored."""
-    return None if mask is None else grey(read_picture(mask).pixels) == 0
+def _usable(mask: Path | None, picture: LoadedPicture) -> NDArray[np.bool_] | None:
+    """(h, w) True where the mask is black, that is, where nothing of the picture is to be ignored."""
+    return None if mask is None else grey(read_sized(mask, size_of(picture.pixels)).pixels) == 0
 
 
 def _draw(

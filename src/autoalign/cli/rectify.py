@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from autoalign.cli.outputs import check_outputs
+from autoalign.cli.files import check_outputs
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
 from autoalign.files.points import PLANE_POINTS, read_points
 from autoalign.files.read import read_picture

@@ -6,7 +6,6 @@ Only options are looked up: a variable AUTOALIGN_FIXED must not stand in for a p
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from cyclopts import App, CycloptsError
 from cyclopts.argument import ArgumentCollection
@@ -38,9 +37,13 @@ def _options(arguments: ArgumentCollection) -> ArgumentCollection:
 
 def _check_names(app: App, arguments: ArgumentCollection) -> None:
     """Refuse a name in the file that no command knows: it would be passed over in silence, misspelt as it is."""
-    for name in _file.config:
+    try:
+        names = list(_file.config)
+    except CycloptsError as error:
+        raise CycloptsError(msg=f"{error}: {FILE}") from error
+    for name in names:
         if not any(_knows(known, name) for known in (arguments, *_of_other_commands(app))):
-            raise CycloptsError(msg=f"no command has the option {name!r} that is set: {Path(FILE)}")
+            raise CycloptsError(msg=f"no command has the option {name!r} that is set: {FILE}")
 
 
 def _knows(arguments: ArgumentCollection, name: str) -> bool:
