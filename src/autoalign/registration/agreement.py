@@ -21,6 +21,7 @@ _OVERLAY_PIXELS = 0.1e6  # the overlap is looked at in so many pixels: coarse, s
 _BLOCK = 12  # px of the overlay
 _FLAT = 3.0  # grey levels of standard deviation under which a block shows nothing
 _SHIFTS = 40  # block orders that make the chance distribution
+_PARTS = 4  # parts of the overlap, each way
 _CHANCE = 0.05  # share of blocks that agree by chance
 
 _Float = NDArray[np.float32]
@@ -32,14 +33,11 @@ class Agreement:
 
     blocks: int  # with structure in either picture
     agreeing: int  # of them, that correlate better than 19 in 20 by chance
+    share: float  # of the blocks that agree, in the middle one of the parts of the overlap: a caption fills few parts
     correlation: float  # mean over the blocks, -1 to 1; of gradients where those agree better
 
-    @property
-    def share(self) -> float:
-        return self.agreeing / self.blocks if self.blocks else 0.0
 
-
-NO_AGREEMENT = Agreement(blocks=0, agreeing=0, correlation=0.0)
+NO_AGREEMENT = Agreement(blocks=0, agreeing=0, share=0.0, correlation=0.0)
 
 
 def agreement(
@@ -111,7 +109,7 @@ def _blocks(image: NDArray[np.generic]) -> NDArray[np.generic]:
 
 
 def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
-    whole = np.asarray(_blocks(valid)).all(1)
+    whole = np.flatnonzero(np.asarray(_blocks(valid)).all(1))
     a, b = (np.asarray(_blocks(p), np.float32)[whole] for p in (fixed, moving))
     a_contrast, b_contrast = a.std(1), b.std(1)
     told = np.maximum(a_contrast, b_contrast) > _FLAT
@@ -125,4 +123,20 @@ def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
     shifts = np.unique(np.linspace(1, len(a) - 1, _SHIFTS).astype(int))
     by_chance = np.concatenate([(a * np.roll(b, int(s), axis=0)).mean(1) for s in shifts])
     agreeing = correlation > np.quantile(by_chance, 1.0 - _CHANCE)
-    return Agreement(blocks=len(a), agreeing=int(agreeing.sum()), correlation=float(correlation.mean()))
+    return Agreement(
+        blocks=len(a),
+        agreeing=int(agreeing.sum()),
+        share=_middle_share(agreeing, np.stack(np.divmod(whole[told], fixed.shape[1] // _BLOCK), 1)),
+        correlation=float(correlation.mean()),
+    )
+
+
+def _middle_share(agreeing: Mask, places: NDArray[np.int64]) -> float:
+    """Median over the parts of the overlap of the share of blocks that agree; `places` (n, 2) are rows and columns."""
+    low, high = places.min(0), places.max(0) + 1
+    part = (places - low) * _PARTS // (high - low)
+    index = part[:, 0] * _PARTS + part[:, 1]
+    counts = np.bincount(index, minlength=_PARTS**2)
+    shares = np.bincount(index, agreeing, minlength=_PARTS**2) / np.maximum(counts, 1)
+    telling = counts >= min(4, counts.max())
+    return float(np.median(shares[telling]))

@@ -1,4 +1,4 @@
-"""The page: two pictures in, one Alignment out. Detect, match, consensus, refine, verdict; harder while it is not clear."""
+"""The page: two pictures in, one Alignment out. Detect, match, consensus, refine, verdict; then harder, if not clear."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from autoalign.registration.verdict import (
     Status,
     Verdict,
     VerdictOptions,
+    hints,
     judge,
     judge_typed,
     nothing_found,
@@ -186,8 +187,11 @@ def align(
     pair = _prepare(fixed, moving, fixed_valid, moving_valid)
     attempts: list[Attempt] = []
     for rung in rungs(options.effort, options.detector):
+        if rung.on_a_hint and not any(hints(attempt.evidence) for attempt in attempts):
+            continue
         attempts.append(_attempt(pair, rung, options))
-        if attempts[-1].verdict.status == "aligned":
+        error = attempts[-1].verdict.expected_error_px
+        if attempts[-1].verdict.status == "aligned" and error is not None and error <= rung.enough_px:
             break
     return Alignment(
         fixed_size=size_of(fixed),
@@ -346,9 +350,11 @@ def _general(choice: ModelChoice) -> ModelName:
 
 
 def _rank(attempt: Attempt) -> tuple[int, float]:
-    """Better verdicts first, then the less probable consensus."""
-    order = {"aligned": 2, "doubtful": 1, "rejected": 0}
-    return order[attempt.verdict.status], -attempt.evidence.log10_false_alarms if attempt.evidence else -np.inf
+    """Better verdicts first; then the smaller expected error, or where there is none the less probable consensus."""
+    error = attempt.verdict.expected_error_px
+    if error is not None:
+        return (2 if attempt.verdict.status == "aligned" else 1), -error
+    return 0, -attempt.evidence.log10_false_alarms if attempt.evidence else -np.inf
 
 
 @contextmanager

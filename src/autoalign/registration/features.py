@@ -8,15 +8,16 @@ not their edges, were aligned (up to 2 px), and the shrunken working picture has
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from autoalign.geometry.homography import Array, Mask
+from autoalign.geometry.homography import Array, Mask, apply
 from autoalign.picture.pixels import resize_map, shrink, size_of
+from autoalign.registration.simulate import views
 
 Detector = Literal["orb", "sift"]
 DETECTORS: tuple[Detector, ...] = get_args(Detector)
@@ -39,6 +40,8 @@ class FeatureOptions:
     """sift: least contrast of a keypoint (0.04 is OpenCV's default)"""
     root: bool = True
     """sift: compare square roots of the histograms (RootSIFT)"""
+    tilts: tuple[float, ...] = ()
+    """look at the picture as from the side too, squeezed by these factors (ASIFT)"""
 
     def __post_init__(self) -> None:
         if self.detector not in DETECTORS or self.working_pixels < 1 or self.max_features < 1 or self.contrast <= 0:
@@ -68,7 +71,13 @@ def detect(image: NDArray[np.uint8], options: FeatureOptions, valid: Mask | None
     small = shrink(image, options.working_pixels)
     mask = None if valid is None else _shrink_mask(valid, size_of(small.pixels))
     find = _sift if options.detector == "sift" else _orb
-    return _in_full_pixels(find(small.pixels, options, mask), small.full_from_small)
+    found = []
+    for view in views(small.pixels, mask, options.tilts):
+        share = replace(options, max_features=max(1, round(options.max_features / view.tilt)))
+        found.append(
+            _in_full_pixels(find(view.pixels, share, view.mask), small.full_from_small @ view.picture_from_view)
+        )
+    return found[0] if len(found) == 1 else _pooled(found)
 
 
 def _shrink_mask(valid: Mask, size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -79,11 +88,26 @@ def _shrink_mask(valid: Mask, size: tuple[int, int]) -> NDArray[np.uint8]:
     return (share > 0.999).astype(np.uint8) * 255
 
 
-def _in_full_pixels(found: Features, full_from_small: Array) -> Features:
-    scale = full_from_small[(0, 1), (0, 1)]
-    pixel = float(scale.mean())
+def _pooled(found: Sequence[Features]) -> Features:
+    """The features of all views as those of one picture."""
+
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(features, name) for features in found])
+
     return Features(
-        points=found.points * scale + full_from_small[:2, 2],
+        points=joined("points"),
+        sizes=joined("sizes"),
+        angles=joined("angles"),
+        sigmas=joined("sigmas"),
+        descriptors=joined("descriptors"),
+        detector=found[0].detector,
+    )
+
+
+def _in_full_pixels(found: Features, full_from_small: Array) -> Features:
+    pixel = float(np.sqrt(np.linalg.det(full_from_small[:2, :2])))
+    return Features(
+        points=apply(full_from_small, found.points),
         sizes=found.sizes * pixel,
         angles=found.angles,
         sigmas=found.sigmas * pixel,
@@ -93,7 +117,7 @@ def _in_full_pixels(found: Features, full_from_small: Array) -> Features:
 
 
 def _spread(keypoints: Sequence[cv2.KeyPoint], size: tuple[int, int], count: int) -> NDArray[np.int64]:
-    """Indices of at most `count` keypoints: the strongest of every cell of a grid, then the second of every cell, and so on.
+    """Indices of at most `count` keypoints: the strongest of every cell of a grid, then the second of every cell, etc.
 
     The order is total, so that it does not depend on the order in which threads delivered them.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from autoalign.registration.features import Detector, FeatureOptions
@@ -19,12 +19,15 @@ class Rung:
     name: str
     features: FeatureOptions
     matching: MatchOptions
+    enough_px: float = float("inf")  # an aligned pair with a greater expected error climbs on
+    on_a_hint: bool = False  # climbed only after a consensus that is not quite chance
 
 
 _ORB = Rung(
     name="orb at 0.6 MP",
     features=FeatureOptions(detector="orb", working_pixels=0.6e6, max_features=3000),
     matching=MatchOptions(ratio=0.85),
+    enough_px=0.5,
 )
 _SIFT = Rung(
     name="sift at 1 MP",
@@ -35,6 +38,13 @@ _MORE_SIFT = Rung(
     name="sift at 2 MP, faint keypoints too",
     features=FeatureOptions(detector="sift", working_pixels=2e6, max_features=8000, contrast=0.005),
     matching=MatchOptions(ratio=0.95),
+    on_a_hint=True,
+)
+_VIEWS = Rung(
+    name="sift from all sides",
+    features=FeatureOptions(detector="sift", working_pixels=0.5e6, max_features=1500, tilts=(2.0, 4.0)),
+    matching=MatchOptions(ratio=0.9),
+    on_a_hint=True,
 )
 _MORE_ORB = Rung(
     name="orb at 2 MP",
@@ -44,8 +54,8 @@ _MORE_ORB = Rung(
 
 LADDER: dict[Effort, tuple[Rung, ...]] = {
     "fast": (_ORB,),
-    "normal": (_ORB, _SIFT, _MORE_SIFT),
-    "max": (_ORB, _SIFT, _MORE_SIFT),
+    "normal": (_ORB, _SIFT, _VIEWS, _MORE_SIFT),
+    "max": tuple(replace(rung, on_a_hint=False) for rung in (_ORB, _SIFT, _VIEWS, _MORE_SIFT)),
 }
 _ONLY_ORB: dict[Effort, tuple[Rung, ...]] = {"fast": (_ORB,), "normal": (_ORB, _MORE_ORB), "max": (_ORB, _MORE_ORB)}
 

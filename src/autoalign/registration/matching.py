@@ -67,8 +67,8 @@ def match(fixed: Features, moving: Features, options: MatchOptions | None = None
 def _nearest(
     descriptors: NDArray[np.float32], others: Features, apart: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """For each of (n, d) descriptors the nearest of the others (n,), its squared distance (n,), that of its nearest rival
-    (n,), and for each of the m others the least distance to any descriptor (m,)."""
+    """For each of (n, d) descriptors the nearest of the others (n,), its squared distance (n,) and that of its nearest
+    rival (n,); and for each of the m others the least squared distance to any descriptor (m,)."""
     n = len(descriptors)
     index, near, rival = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
     least = np.full(len(others), np.inf, np.float32)

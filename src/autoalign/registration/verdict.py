@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autoalign.geometry.chance import disc_chance, first_in_each_cell, log10_false_alarms
-from autoalign.geometry.family import MODELS, ModelName
+from autoalign.geometry.family import MODELS, Model, ModelName
 from autoalign.geometry.homography import Array, invert, jacobian, project
 from autoalign.geometry.least_squares import Correspondences, polish
 from autoalign.geometry.ransac import Consensus
@@ -66,7 +66,7 @@ class Evidence:
     agreement: Agreement
     stretch: tuple[float, float]  # least and greatest scale over the overlap, fixed px per moving px
     anisotropy: float  # greatest ratio of the two scales at one point; inf if the overlay folds or mirrors
-    halves_px: float  # mean distance over the overlap of the transforms of two disjoint halves of the inliers
+    halves_px: float  # mean distance over the overlap of the transforms of two disjoint halves of the evidence
     fit_px: float  # what the covariance of the fit leaves, mean over the overlap
     model_px: float  # what the residuals show that the model cannot follow
 
@@ -122,7 +122,7 @@ def weigh(
         agreement=agreed,
         stretch=stretch,
         anisotropy=anisotropy,
-        halves_px=_halves(consensus, independent[near], overlap),
+        halves_px=_halves(MODELS[model], transform, fitted, overlap),
         fit_px=_root_mean_square(point_errors(MODELS[model], transform, known, overlap)),
         model_px=known.model_px,
     )
@@ -168,12 +168,11 @@ def _shape(transform: Array, points: Array) -> tuple[tuple[float, float], float]
     return (float(scales[:, 1].min()), float(scales[:, 0].max())), anisotropy
 
 
-def _halves(consensus: Consensus, inliers: Correspondences, points: Array) -> float:
-    """Mean distance over points between the transforms that every other inlier and the rest give."""
-    model = MODELS[consensus.model]
-    if len(inliers) < 2 * (model.sample_size + 1) or not len(points):
+def _halves(model: Model, transform: Array, fitted: Correspondences, points: Array) -> float:
+    """Mean distance over points between the transforms that every other fitted pair and the rest give."""
+    if len(fitted) < 2 * (model.sample_size + 1) or not len(points):
         return float("inf")
-    halves = [polish(model, consensus.dst_from_src, inliers[np.arange(i, len(inliers), 2)]) for i in (0, 1)]
+    halves = [polish(model, transform, fitted[np.arange(i, len(fitted), 2)]) for i in (0, 1)]
     (a, wa), (b, wb) = (project(half, points) for half in halves)
     if (wa <= 0).any() or (wb <= 0).any():
         return float("inf")
@@ -181,11 +180,22 @@ def _halves(consensus: Consensus, inliers: Correspondences, points: Array) -> fl
 
 
 def expected_error(evidence: Evidence) -> float:
-    """Mean error over the overlap in fixed px: the fit's, what the model cannot follow, and a floor."""
-    return float(np.sqrt(evidence.fit_px**2 + evidence.model_px**2 + _FLOOR_PX**2))
+    """Mean error over the overlap in fixed px: the fit's, what the model cannot follow, and a floor.
+
+    Two independent halves of the evidence differ by twice the error of the whole, which is the fit's error measured
+    without any assumption; the larger of the two counts.
+    """
+    fit = max(evidence.fit_px, 0.5 * evidence.halves_px if np.isfinite(evidence.halves_px) else 0.0)
+    return float(np.sqrt(fit**2 + evidence.model_px**2 + _FLOOR_PX**2))
+
+
+def hints(evidence: Evidence | None) -> bool:
+    """Whether the consensus, if not enough for a verdict, is more than unrelated pictures give."""
+    return evidence is not None and evidence.log10_false_alarms < _HINT
 
 
 _FLOOR_PX = 0.002
+_HINT = 0.5  # log10 of false alarms; in 139 consensuses of unrelated pictures it was never under 2.3
 
 
 def nothing_found(matches: int) -> Verdict:
@@ -248,7 +258,7 @@ def _rejections(evidence: Evidence, options: VerdictOptions) -> list[tuple[str, 
     if evidence.agreement.share < options.min_agreement:
         found.append(
             (
-                f"{_agree(evidence)}, but only {_blocks(evidence)}: what they share is a small part, as a caption or logo is",
+                f"{_agree(evidence)}, but only {_blocks(evidence)}: they share a small part, as a caption or logo is",
                 "mask what the pictures share but do not show (--fixed-mask, --moving-mask)",
             )
         )
