@@ -30,6 +30,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
     {"picture": ("pixels", "warp", "canvas", "compose")},
     {
         "registration": (
+            "simulate",
             "features",
             "matching",
             "ladder",
@@ -67,6 +68,7 @@ HOMES: dict[str, tuple[str, ...]] = {
         "picture.pixels",
         "picture.warp",
         "picture.compose",
+        "registration.simulate",
         "registration.features",
         "registration.refine",
         "registration.agreement",
