@@ -190,10 +190,16 @@ def _from_pyramid(points: Array, octaves: NDArray[np.int64], size: tuple[int, in
     out = np.empty_like(points)
     for octave in np.unique(octaves):
         at, scale = octaves == octave, _ORB_STEP**octave
-        level_size = (round(size[0] / scale), round(size[1] / scale))
-        picture_from_level = resize_map(size, level_size)
+        picture_from_level = resize_map(size, _level_size(size, int(octave)))
         out[at] = points[at] / scale * picture_from_level[(0, 1), (0, 1)] + picture_from_level[:2, 2]
     return out
+
+
+def _level_size(size: tuple[int, int], octave: int) -> tuple[int, int]:
+    """(w, h) of a level of ORB's pyramid, rounded from single precision as cv2 does it: that decides ties (630 / 1.44)."""
+    inverse = np.float32(1) / np.float32(float(np.float32(_ORB_STEP)) ** octave)
+    w, h = np.rint(np.array(size, np.float32) * inverse).astype(int)
+    return int(w), int(h)
 
 
 def _columns(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Array, Array, Array]:

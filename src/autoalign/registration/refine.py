@@ -35,7 +35,7 @@ from autoalign.geometry.ransac import Consensus
 from autoalign.picture.pixels import Picture, resize_map, shrink, size_of, to_8_bit
 
 _HELD_OUT = 5  # every fifth patch judges
-_SMOOTHING = 0.55  # px; takes away what bilinear sampling would distort (measured: 0.4 to 0.7 are alike, 1.0 is worse)
+_SMOOTHING = 0.6  # px; takes away what bilinear sampling would distort (measured: 0.4 to 0.7 are alike, 1.0 is worse)
 _Float = NDArray[np.float32]
 
 
@@ -123,10 +123,10 @@ def refine(
 
 @dataclass(frozen=True, kw_only=True)
 class _Level:
-    """Both pictures brought to about the same resolution, smoothed, and the maps to their full sizes."""
+    """Both pictures brought to about the same resolution, and the maps to their full sizes."""
 
-    fixed: _Float
-    moving: _Float
+    fixed: Picture
+    moving: _Float  # sampled between its pixels, hence float
     fixed_from_level: Array
     moving_from_level: Array
     shrunk: float  # against the finest level
@@ -149,19 +149,19 @@ def _level(fixed: Picture, moving: Picture, fixed_shrink: float, moving_shrink: 
     small_moving, moving_from_level = _shrunk(moving, moving_shrink)
     return _Level(
         fixed=small_fixed,
-        moving=small_moving,
+        moving=small_moving.astype(np.float32),
         fixed_from_level=fixed_from_level,
         moving_from_level=moving_from_level,
         shrunk=shrunk,
     )
 
 
-def _shrunk(image: Picture, factor: float) -> tuple[_Float, Array]:
-    """The picture as smoothed float32, smaller by `factor`, and the (3, 3) map back to its own pixels."""
+def _shrunk(image: Picture, factor: float) -> tuple[Picture, Array]:
+    """The picture, smaller by `factor`, and the (3, 3) map back to its own pixels."""
     w, h = size_of(image)
     size = (max(1, round(w / factor)), max(1, round(h / factor)))
     small = image if size == (w, h) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), _SMOOTHING)), resize_map((w, h), size)
+    return np.asarray(small), resize_map((w, h), size)
 
 
 def _corners(
@@ -201,7 +201,7 @@ class _Look:
 
 def _look(level: _Level, transform: Array, corners: Array, options: RefineOptions) -> _Look:
     """Sample, normalise and compare all patches; one Gauss-Newton step each."""
-    reach = options.radius + 1  # one more for the gradients
+    reach = options.radius + 2  # one more for the gradients, one for the smoothing
     moving_from_fixed = unit(invert(level.moving_from_level) @ invert(transform) @ level.fixed_from_level)
     centres = np.rint(apply(invert(level.fixed_from_level), corners))
     inside = _patch_inside(centres, reach, size_of(level.fixed), np.eye(3), size_of(level.fixed))
@@ -236,11 +236,11 @@ def _patch_inside(centres: Array, reach: int, own: tuple[int, int], transform: A
     return ok
 
 
-def _fixed_patches(image: _Float, centres: Array, reach: int) -> _Float:
+def _fixed_patches(image: Picture, centres: Array, reach: int) -> _Float:
     """(n, s, s) patches at whole pixels."""
     windows = np.lib.stride_tricks.sliding_window_view(image, (2 * reach + 1, 2 * reach + 1))
     column, row = centres.astype(np.int64).T - reach
-    return np.asarray(windows[row, column])
+    return np.asarray(windows[row, column], np.float32)
 
 
 def _moving_patches(image: _Float, moving_from_fixed: Array, centres: Array, reach: int) -> _Float:
@@ -269,6 +269,14 @@ def _moving_patches(image: _Float, moving_from_fixed: Array, centres: Array, rea
     return np.asarray(np.concatenate(sheets).reshape(n, side, side))
 
 
+def _smoothed(patches: _Float) -> _Float:
+    """Patches (n, s, s) after a small Gaussian, without their outermost pixels (n, s - 2, s - 2)."""
+    outer = float(np.exp(-0.5 / _SMOOTHING**2))
+    kernel = np.array([outer, 1.0, outer], np.float32) / np.float32(1 + 2 * outer)
+    rows = kernel[0] * (patches[:, :-2] + patches[:, 2:]) + kernel[1] * patches[:, 1:-1]
+    return np.asarray(kernel[0] * (rows[:, :, :-2] + rows[:, :, 2:]) + kernel[1] * rows[:, :, 1:-1])
+
+
 def _normalise(patches: _Float, window: _Float) -> tuple[_Float, _Float]:
     """Patches (n, s, s) with weighted mean 0 and weighted variance 1, and their standard deviations (n,)."""
     mean = np.einsum("nij,ij->n", patches, window)
@@ -280,8 +288,9 @@ def _normalise(patches: _Float, window: _Float) -> tuple[_Float, _Float]:
 def _gauss_newton(a: _Float, b: _Float) -> tuple[Array, Array, Array]:
     """Shift (n, 2) of b against a in px, normalised correlation (n,), and the shift's standard deviation (n,).
 
-    a, b are patches (n, s, s) with a rim of one pixel that only serves the gradients.
+    a, b are patches (n, s, s) with a rim of two pixels, one spent on the smoothing and one on the gradients.
     """
+    a, b = _smoothed(a), _smoothed(b)
     side = a.shape[1] - 2
     bell = np.exp(-0.5 * (np.arange(side) - (side - 1) / 2) ** 2 / (side / 3.5) ** 2)
     window = (np.outer(bell, bell) / bell.sum() ** 2).astype(np.float32)
