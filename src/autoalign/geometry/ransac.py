@@ -4,23 +4,33 @@ The loop draws minimal samples in batches, lets the good matches speak first (PR
 they cost anything (oriented constraint), scores with MSAC on the symmetric transfer error, and improves each new best
 by least squares on its inliers (local optimisation). It ends when a better consensus has become improbable.
 
-Sources: Fischler and Bolles 1981; Chum and Matas, PROSAC, 2005; Torr and Zisserman, MSAC, 2000; Chum, Matas and Kittler,
-LO-RANSAC, 2003; Lebeda, Matas and Chum, LO+, 2012.
+Sources: Fischler and Bolles 1981; Chum and Matas, PROSAC, 2005; Torr and Zisserman, MSAC, 2000; Chum, Matas and
+Kittler, LO-RANSAC, 2003; Lebeda, Matas and Chum, LO+, 2012.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil, comb, factorial, log
 
 import numpy as np
 from numpy.typing import NDArray
 
 from autoalign.geometry.family import MODELS, Model, ModelName, solve_samples
-from autoalign.geometry.homography import Array, Mask, determinant, project, symmetric_transfer_error_squared
+from autoalign.geometry.homography import (
+    IDENTITY,
+    Array,
+    Mask,
+    determinant,
+    symmetric_transfer_error_squared,
+    transfer_error_squared,
+    unit,
+)
 from autoalign.geometry.least_squares import Correspondences, polish
 
-_GROWTH = 200_000  # draws after which PROSAC has become plain RANSAC (T_N in the paper)
-_GLANCE = 100  # matches that a hypothesis is first judged by
+_GROWTH = 200_000  # draws after which PROSAC has become plain RANSAC, at most (T_N in the paper)
+_FIRST_BATCH = 100  # samples; a good pair needs no more
+_FEW = 10  # hypotheses of a batch that are judged both ways
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +42,11 @@ class RansacOptions:
     confidence: float = 0.999
     """stop when a larger consensus is this improbable to have been missed"""
     max_trials: int = 20_000
-    """samples at most"""
-    batch: int = 500
-    """samples drawn and judged together"""
+    """samples drawn, at most"""
+    batch: int = 2_000
+    """samples drawn and judged together, at most: each batch is as large as all before it"""
     seed: int = 0
-    """of the one random generator"""
+    """seed of the one random generator"""
 
     def __post_init__(self) -> None:
         if not (self.threshold > 0 and 0 < self.confidence < 1 and self.max_trials > 0 and self.batch > 0):
@@ -69,6 +79,8 @@ def ransac(
     member = MODELS[model]
     if len(pairs) <= member.sample_size:
         return None
+    if member.sample_size == 0:
+        return settle(member, unit(IDENTITY), pairs, options.threshold)
     found, trials = _search(member, pairs, options)
     return None if found is None else settle(member, found, pairs, options.threshold, trials)
 
@@ -76,7 +88,7 @@ def ransac(
 def settle(
     model: Model, transform: Array, pairs: Correspondences, threshold: float, trials: int = 0, max_rounds: int = 10
 ) -> Consensus | None:
-    """Refit by least squares until the inliers stop changing; None where fewer agree than fix the model, and one more."""
+    """Refit by least squares until the inliers stop changing; None where no more agree than fix the model."""
     inliers = _errors_squared(transform, pairs) < threshold**2
     for _ in range(max_rounds):
         if inliers.sum() <= model.sample_size:
@@ -98,43 +110,54 @@ def _errors_squared(transform: Array, pairs: Correspondences) -> Array:
 def _search(model: Model, pairs: Correspondences, options: RansacOptions) -> tuple[Array | None, int]:
     """The best transform found, and the number of samples drawn."""
     rng = np.random.default_rng(options.seed)
-    n, limit = len(pairs), options.threshold**2
-    glance = rng.permutation(n)[:_GLANCE]
-    tops = _prosac_tops(n, model.sample_size, options.max_trials)
-    best, best_cost = None, n * limit
-    drawn, needed = 0, options.max_trials
+    n, m, limit = len(pairs), model.sample_size, options.threshold**2
+    most = min(options.max_trials, _trials_to_draw_all(n, m, options.confidence))
+    tops, growing = _prosac_order(n, m, most)
+    best, best_cost, wide_best = None, n * limit, n*limit*_WIDE
+    drawn, needed = 0, most
     while drawn < needed:
-        samples = _draw(rng, tops[drawn : drawn + options.batch], model.sample_size)
-        drawn += options.batch
-        candidate, cost = _best_of(_hypotheses(model, pairs, samples), pairs, glance, limit)
-        if candidate is None or cost >= best_cost:
+        batch = slice(drawn, drawn + min(max(drawn, _FIRST_BATCH), options.batch))
+        drawn = min(batch.stop, most)
+        samples = _draw(rng, tops[batch], growing[batch], m)
+        candidate, cost = _best_of(_hypotheses(model, pairs, samples), pairs, limit)
+        if candidate is None or cost >= wide_best:
             continue
-        best, best_cost = _optimise_locally(model, candidate, cost, pairs, options.threshold)
+        wide_best=cost
+        cost = np.minimum(_errors_squared(candidate, pairs), limit).sum()
+        new,new_cost = _optimise_locally(model, candidate, cost, pairs, options.threshold)
+        if new_cost>=best_cost: continue
+        best,best_cost=new,new_cost
         inliers = _errors_squared(best, pairs) < limit
-        needed = min(needed, _trials_needed(inliers, tops, model.sample_size, options.confidence))
-    return best, min(drawn, options.max_trials)
+        needed = min(needed, _trials_needed(inliers, tops, m, options.confidence))
+    return best, drawn
 
 
-def _prosac_tops(n: int, m: int, trials: int) -> NDArray[np.int64]:
-    """(trials,) how many of the best matches each draw may use: the growth function of PROSAC, in closed form.
+def _trials_to_draw_all(n: int, m: int, confidence: float) -> int:
+    """Draws of m out of n, with repeats, that leave out a given sample with a chance under 1 - confidence."""
+    return ceil(-log(1 - confidence) * n**m / factorial(m))
 
-    T_k, the draws after which the set has k members, is _GROWTH x C(k, m) / C(n, m); the set for draw t is the smallest k
-    with T_k >= t.
+
+def _prosac_order(n: int, m: int, trials: int) -> tuple[NDArray[np.int64], Mask]:
+    """(trials,) how many of the best matches each draw may use, and whether it must use the last of these.
+
+    The growth function of PROSAC in closed form: T_k, the draws after which the set has k members, is T_n x C(k, m) /
+    C(n, m), and the set for draw t is the smallest k with T_k >= t. T_n is no more than the number of samples there
+    are, else few matches would be drawn from their first few for ever. Once all matches are in, draws are free.
     """
     k = np.arange(m, n + 1)
-    growth = np.ones(len(k))
+    reached = np.full(len(k), float(min(_GROWTH, comb(n, m))))
     for i in range(m):
-        growth *= (k - i) / (n - i)
-    # Each size gets at least one draw (T'_{k+1} = T'_k + ceil(T_{k+1} - T_k) in the paper).
-    steps = np.concatenate([[1.0], np.ceil(np.diff(growth * _GROWTH))])
-    return np.asarray(k[np.minimum(np.searchsorted(np.cumsum(steps), np.arange(1, trials + 1)), len(k) - 1)])
+        reached *= (k - i) / (n - i)
+    # Each size gets at least one draw (T'_{k+1} = T'_k + ceil(T_{k+1} - T_k) in the paper; a hair less for rounding).
+    steps = np.concatenate([[1.0], np.ceil(np.diff(reached) - 1e-9)])
+    growth, draws = np.cumsum(steps), np.arange(1, trials + 1)
+    return k[np.minimum(np.searchsorted(growth, draws), len(k) - 1)], draws <= growth[-1]
 
 
-def _draw(rng: np.random.Generator, tops: NDArray[np.int64], m: int) -> NDArray[np.int64]:
-    """(k, m) distinct indices per row: the last of the top matches, and m - 1 of those before it."""
-    samples = np.empty((len(tops), m), np.int64)
-    samples[:, 0] = tops - 1
-    samples[:, 1:] = (rng.random((len(tops), m - 1)) * (tops - 1)[:, None]).astype(np.int64)
+def _draw(rng: np.random.Generator, tops: NDArray[np.int64], growing: Mask, m: int) -> NDArray[np.int64]:
+    """(k, m) distinct indices per row among the top matches, the last of them always one where the set is growing."""
+    samples = (rng.random((len(tops), m)) * (tops - growing)[:, None]).astype(np.int64)
+    samples[growing, 0] = tops[growing] - 1
     ordered = np.sort(samples, axis=1)
     return np.asarray(samples[(ordered[:, 1:] != ordered[:, :-1]).all(1)])
 
@@ -145,25 +168,18 @@ def _hypotheses(model: Model, pairs: Correspondences, samples: NDArray[np.int64]
     return transforms[sound & (determinant(transforms) > 0)]
 
 
-def _best_of(
-    hypotheses: Array, pairs: Correspondences, glance: NDArray[np.int64], limit: float
-) -> tuple[Array | None, float]:
-    """The hypothesis of least MSAC cost. All are judged one way on a few matches, the best tenth both ways on all."""
+_WIDE=1.0
+def _best_of(hypotheses: Array, pairs: Correspondences, limit: float) -> tuple[Array | None, float]:
+    """The hypothesis of least MSAC cost: all are judged one way, the best few both ways."""
     if not len(hypotheses):
         return None, np.inf
-    if len(pairs) > len(glance):
-        rough = _one_way_cost(hypotheses, pairs[glance], limit)
-        hypotheses = hypotheses[np.argsort(rough, kind="stable")[: max(10, len(hypotheses) // 10)]]
-    costs = np.minimum(_errors_squared(hypotheses, pairs), limit).sum(-1)
+    limit=limit*_WIDE
+    one_way = transfer_error_squared(hypotheses, pairs.src, pairs.dst) / pairs.dst_sigma**2
+    rough = np.minimum(one_way, limit).sum(-1)
+    few = hypotheses[np.argsort(rough, kind="stable")[:_FEW]]
+    costs = np.minimum(_errors_squared(few, pairs), limit).sum(-1)
     chosen = int(np.argmin(costs))
-    return hypotheses[chosen], float(costs[chosen])
-
-
-def _one_way_cost(hypotheses: Array, pairs: Correspondences, limit: float) -> Array:
-    projected, w = project(hypotheses, pairs.src)
-    with np.errstate(invalid="ignore", over="ignore"):
-        error = ((projected - pairs.dst) ** 2).sum(-1) / pairs.dst_sigma**2
-    return np.asarray(np.where(w > 0, np.fmin(error, limit), limit).sum(-1))
+    return few[chosen], float(costs[chosen])
 
 
 def _optimise_locally(

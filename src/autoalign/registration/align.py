@@ -51,11 +51,11 @@ class AlignOptions:
     """What kind of transform, how hard to look, and the options of every stage."""
 
     model: ModelChoice = "auto"
-    """Kind of transform; auto takes the simplest that explains the pictures."""
+    """kind of transform; auto takes the simplest that explains the pictures"""
     detector: DetectorChoice = "auto"
-    """Kind of keypoints; auto begins with orb and goes on with sift where the verdict is not clear."""
+    """kind of keypoints; auto begins with orb and goes on with sift where the verdict is not clear"""
     effort: Effort = "normal"
-    """How hard to look before a pair is given up."""
+    """how hard to look before a pair is given up; max also looks from all sides, which takes seconds"""
     ransac: RansacOptions = field(default_factory=RansacOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)

@@ -44,15 +44,15 @@ class RefineOptions:
     """How the transform is sharpened on the pixels."""
 
     patches: int = 1500
-    """at most; 0 leaves the transform of the keypoints as it is"""
+    """patches compared, at most; 0 leaves the transform of the keypoints as it is"""
     radius: int = 12
     """a patch is 2 x radius + 1 pixels wide"""
     rounds: int = 3
-    """on the full pictures"""
+    """times that the patches are compared at full size"""
     min_correlation: float = 0.6
-    """a patch takes part if its normalised correlation is above"""
+    """normalised correlation above which a patch takes part"""
     max_shift: float = 2.0
-    """px; a patch that wants to move further is dropped"""
+    """px; a patch that wants to move further takes no part"""
 
     def __post_init__(self) -> None:
         if self.patches < 0 or self.radius < 3 or self.rounds < 1 or not 0 < self.min_correlation < 1:

@@ -31,23 +31,23 @@ class VerdictOptions:
     """What is asked of the evidence before it counts."""
 
     max_log10_false_alarms: float = -4.0
-    """of the consensus: random matches agree as well with a chance of 1 in 10^4"""
+    """log10 of how often random matches agree as well; above, the pair is rejected"""
     sure_log10_false_alarms: float = -12.0
-    """above, the pixels must agree more clearly"""
+    """above this, the pixels must make up for the few matches, or the pair is doubtful"""
     min_agreement: float = 0.25
-    """share of the blocks of the overlap that agree; 0.05 do by chance"""
+    """share of the overlap that must agree, or the pair is rejected; 0.05 does by chance"""
     sure_agreement: float = 0.4
-    """below, the pair is doubtful"""
+    """share of the overlap below which the pair is doubtful"""
     max_expected_error_px: float = 3.0
-    """above, and above max_expected_error_share, the pair is doubtful"""
+    """px of expected error above which the pair is doubtful, if it is above the share too"""
     max_expected_error_share: float = 0.005
-    """of the diagonal of the fixed picture"""
+    """the same as a share of the diagonal of the fixed picture"""
     max_stretch: float = 20.0
-    """largest change of scale, either way, that a camera makes"""
+    """largest change of scale, either way, that is believed"""
     max_anisotropy: float = 12.0
-    """largest ratio of the two scales at a point"""
+    """largest ratio of the two scales at one point that is believed"""
     min_overlap: float = 0.01
-    """share of the smaller picture"""
+    """share of the fixed picture that must be covered"""
 
     def __post_init__(self) -> None:
         if self.max_expected_error_px <= 0 or self.max_stretch <= 1 or not 0 <= self.min_agreement <= 1:
