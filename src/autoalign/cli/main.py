@@ -97,9 +97,15 @@ def main(tokens: Sequence[str] | None = None) -> int:
         # A wrong call is a ValueError, and so is many a fault in a library: -v tells them apart.
         if isinstance(error, ValueError) or code == Exit.BUG:
             _trace(tokens)
-        reason = str(error) or type(error).__name__
-        complain(reason if code != Exit.BUG else f"this is a bug ({type(error).__name__}: {reason}); -v shows where")
+        complain(_reason(error, code))
         return code
+
+
+def _reason(error: BaseException, code: Exit) -> str:
+    if code == Exit.INTERRUPTED:
+        return "interrupted"
+    reason = str(error) or type(error).__name__
+    return reason if code != Exit.BUG else f"this is a bug ({type(error).__name__}: {reason}); -v shows where"
 
 
 def _trace(tokens: Sequence[str]) -> None:
