@@ -4,8 +4,9 @@
 
 Two views of one photograph are rendered at every size (known transform, other exposure, noise) and saved as JPEG. The
 floor is what any program must do: decode both, warp one, encode it. `autoalign` is the same plus `align`. The recipes
-are OpenCV's SIFT + ratio test + MAGSAC++, at full size and shrunken to 1 MP, plus the same floor. Times are the least of
-the repeats, in units of the floor; memory is the peak of a fresh process over the bytes of the two decoded pictures.
+are OpenCV's SIFT + ratio test + MAGSAC++, at full size and shrunken to 1 MP, plus the same floor. Times are the least
+of the repeats, in units of the floor; memory is what a fresh process takes at its peak, beyond its imports, over the
+bytes of the two decoded pictures.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -22,7 +21,9 @@ import cv2
 import numpy as np
 
 from autoalign.files.read import read_picture
+from autoalign.geometry.family import MODELS, fit
 from autoalign.geometry.homography import apply, project
+from autoalign.geometry.least_squares import correspondences, polish
 from autoalign.registration.align import AlignOptions, align
 
 
@@ -114,6 +115,17 @@ def true_error(job: dict[str, Any], fixed_from_moving: np.ndarray, moving: np.nd
     return float(np.linalg.norm(project(fixed_from_moving, grid)[0] - there, axis=1)[inside].mean())
 
 
+def landmark_noise(job: dict[str, Any]) -> float:
+    """Root-mean-square by which hand-placed landmarks miss their own best homography, for the freedom that it has."""
+    if not job["landmarks"]:
+        return 0.0
+    marks = np.loadtxt(job["landmarks"], delimiter=",", skiprows=1)[:, :4]
+    pairs = correspondences(marks[:, :2], marks[:, 2:])
+    own = polish(MODELS["homography"], fit("homography", pairs.src, pairs.dst), pairs)
+    residuals = apply(own, pairs.src) - pairs.dst
+    return float(np.sqrt((residuals**2).sum(1).mean() * 2 * len(marks) / max(2 * len(marks) - 8, 1)))
+
+
 def run(job: dict[str, Any], effort: str) -> dict[str, Any]:
     cv2.setNumThreads(1)
     fixed, moving = (read_picture(Path(job[k])).pixels for k in ("fixed", "moving"))
@@ -138,31 +150,81 @@ def run(job: dict[str, Any], effort: str) -> dict[str, Any]:
     if job["kind"] == "related":
         found = alignment.best.fixed_from_moving
         row["error"] = float("inf") if found is None else true_error(job, found, moving, fixed)
+        row["truth_noise"] = landmark_noise(job)
     return row
 
 
 def report(rows: list[dict[str, Any]]) -> None:
+    """A line for each related pair and for each other one that was not rejected, and the tally of each group."""
+    print(f"{'':5}{'pair':38}{'verdict':10}{'error':>9}{'expected':>9}  model       rung         numbers")
     for row in sorted(rows, key=lambda r: (r["kind"], r.get("error", 0.0))):
         if row["kind"] == "related" or row["status"] != "rejected":
-            e = row["evidence"][row["best"]]
-            numbers = (
-                ""
-                if e is None
-                else (
-                    f"nfa {e['log10_false_alarms']:8.1f} inl {e['independent_inliers']:4d}/{e['independent_matches']:<4d} "
-                    f"blocks {e['share']:.2f} of {e['agreement']['blocks']:<4d} aniso {e['anisotropy']:5.1f} "
-                    f"halves {e['halves_px']:7.2f} fit {e['fit_px']:7.3f} model {e['model_px']:6.3f} overlap {e['overlap']:.2f}"
-                )
-            )
-            name = re.sub(r"^(.{38}).*", r"\1", row["name"])
+            error, expected = row.get("error", 0.0), row["expected"] or 0.0
             print(
-                f"{row['kind'][:4]} {name:38} {row['status'][:5]:5} {row.get('error', 0):9.3f} {row['expected'] or 0:7.3f} "
-                f"{row['model'] or '-':11.11} {row['rung'][:12]:12} {numbers}"
+                f"{row['kind'][:4]} {row['name'][:37]:38}{row['status']:10}{error:9.3f}{expected:9.3f}  "
+                f"{row['model'] or '-':11.11} {row['rung'][:12]:12} {numbers(row['evidence'][row['best']])}"
             )
     for kind in dict.fromkeys(r["kind"] for r in rows):
         group = [r for r in rows if r["kind"] == kind]
         tally = {s: sum(r["status"] == s for r in group) for s in ("aligned", "doubtful", "rejected")}
         print(kind, len(group), tally, f"mean {np.mean([r['seconds'] for r in group]):.2f} s")
+
+
+def numbers(evidence: dict[str, Any] | None) -> str:
+    if evidence is None:
+        return ""
+    parts = {
+        "log nfa": "{log10_false_alarms:.1f}",
+        "alone": "{independent_inliers}/{independent_matches}",
+        "share": "{share:.2f}",
+        "anisotropy": "{anisotropy:.1f}",
+        "halves": "{halves_px:.2f}",
+        "fit": "{fit_px:.3f}",
+        "model": "{model_px:.3f}",
+        "overlap": "{overlap:.2f}",
+    }
+    return " ".join(f"{name} {form.format(**evidence)}" for name, form in parts.items())
+
+
+def calibration(rows: list[dict[str, Any]]) -> None:
+    """True error over expected error of aligned pairs whose truth is exact or has landmarks (less their own noise)."""
+    for name, chosen in (("exact", "exact"), ("landmarks", ("cmp", "mm_cv"))):
+        group = [
+            r for r in rows if r["kind"] == "related" and r["status"] == "aligned" and r["name"].startswith(chosen)
+        ]
+        true = np.array([np.sqrt(max(r["error"] ** 2 - r["truth_noise"] ** 2, 0.0)) for r in group])
+        ratio = true / np.array([r["expected"] for r in group])
+        print(
+            f"true over expected error, {name}: {len(group)} pairs, median {np.median(ratio):.2f}, "
+            f"within twice {np.mean(ratio <= 2):.1%}, largest {ratio.max():.1f}"
+        )
+
+
+def leave_one_scene_out(rows: list[dict[str, Any]]) -> None:
+    """For each piece of evidence: the gap between true and false, and what thresholds chosen without a scene do to it.
+
+    The threshold is the middle of the gap that the other scenes leave. False for the false alarms are the consensuses
+    of unrelated pictures, for the agreement those of captions and traps.
+    """
+
+    def told(kinds: tuple[str, ...], key: str) -> list[tuple[float, str]]:
+        return [(e[key], r["scene"]) for r in rows if r["kind"] in kinds for e in r["evidence"] if e]
+
+    true = [r for r in rows if r["kind"] == "related" and r["error"] < 5 and r["status"] != "rejected"]
+    for key, sign, kinds in (("log10_false_alarms", -1, ("unrelated",)), ("share", 1, ("trap", "caption"))):
+        good = [(sign * r["evidence"][r["best"]][key], r["scene"]) for r in true]
+        bad = [(sign * value, scene) for value, scene in told(kinds, key)]
+        wrong = 0
+        for scene in {s for _, s in good + bad}:
+            low = max((v for v, s in bad if s != scene), default=-np.inf)
+            high = min((v for v, s in good if s != scene), default=np.inf)
+            middle = (low + high) / 2
+            wrong += sum(v > middle for v, s in bad if s == scene) + sum(v <= middle for v, s in good if s == scene)
+        worst_good, worst_bad = sign * min(v for v, _ in good), sign * max(v for v, _ in bad)
+        print(
+            f"{key}: {len(good)} true, the least clear {worst_good:.2f}; {len(bad)} false, the most misleading "
+            f"{worst_bad:.2f}; {wrong} wrong with thresholds of the other scenes"
+        )
 
 
 def main() -> None:
@@ -173,15 +235,22 @@ def main() -> None:
     parser.add_argument("--effort", default="normal")
     parser.add_argument("--save", type=Path)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--load", type=Path, help="report on rows saved earlier")
     arguments = parser.parse_args()
+    rows = json.loads(arguments.load.read_text()) if arguments.load else measure(arguments)
+    if arguments.save:
+        arguments.save.write_text(json.dumps(rows))
+    report(rows)
+    calibration(rows)
+    leave_one_scene_out(rows)
+
+
+def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     root = arguments.data / "pairs"
     jobs = related(root) + traps(arguments.data / "traps")
     jobs += unrelated(root, arguments.unrelated, 1, "unrelated") + unrelated(root, arguments.captions, 2, "caption")
     with ProcessPoolExecutor(arguments.workers) as pool:
-        rows = list(pool.map(run, jobs, [arguments.effort] * len(jobs), chunksize=4))
-    if arguments.save:
-        arguments.save.write_text(json.dumps(rows))
-    report(rows)
+        return list(pool.map(run, jobs, [arguments.effort] * len(jobs), chunksize=4))
 
 
 if __name__ == "__main__":
