@@ -6,7 +6,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import numpy as np
@@ -18,7 +17,7 @@ from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
 from autoalign.files.points import CORRESPONDENCES, read_points
 from autoalign.files.read import LoadedPicture, read_picture
 from autoalign.files.record import record
-from autoalign.files.sidecar import Sidecar, default_sidecar, write_sidecar
+from autoalign.files.sidecar import default_sidecar, sidecar_text, write_sidecar
 from autoalign.files.write import default_output, write_picture
 from autoalign.geometry.ransac import RansacOptions
 from autoalign.picture.canvas import CanvasKind, canvas
@@ -92,7 +91,7 @@ def pair(
     written = _draw(alignment, still, mover, files, output, common.overwrite)
     kept = record(alignment, still, mover, drawn={"canvas": files.canvas}, timings=files.timings)
     if sidecar is None:
-        sys.stdout.write(_sidecar_text(kept))
+        sys.stdout.write(sidecar_text(kept))
     else:
         write_sidecar(sidecar, kept, common.overwrite)
         written.append(sidecar)
@@ -103,6 +102,8 @@ def pair(
         tell(line, style=STYLE_OF[alignment.status], to_stderr=sidecar is None)
     if alignment.verdict.advice:
         note(f"what may help: {alignment.verdict.advice}", common)
+    if output not in written and output.exists():
+        note(f"left as it was, from an earlier run: {output}", common)
     if written:
         note(f"wrote {', '.join(map(str, written))}", common)
     return Exit.DONE if alignment.status == "aligned" else Exit.NOT_ALIGNED
@@ -121,14 +122,6 @@ def verdict_line(alignment: Alignment, seconds: float) -> str:
     numbers.append(f"{seconds:.1f} s")
     why = f": {alignment.reason}" if alignment.status == "doubtful" else ""
     return f"{alignment.status}: {', '.join(numbers)}{why}"
-
-
-def _sidecar_text(sidecar: Sidecar) -> str:
-    """What `write_sidecar` would put into a file."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "sidecar.json"
-        write_sidecar(path, sidecar)
-        return path.read_text()
 
 
 def _align(fixed: LoadedPicture, moving: LoadedPicture, files: PairFiles, options: AlignOptions) -> Alignment:

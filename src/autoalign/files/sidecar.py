@@ -88,18 +88,25 @@ def transform_of(sidecar: Sidecar) -> NDArray[np.float64]:
 
 
 def write_sidecar(path: str | Path, sidecar: Sidecar, overwrite: bool = False) -> None:
-    """Write the record. Equal records give equal bytes, and what is read back is equal but for tuples turned lists.
+    """Write the record as `sidecar_text` gives it, in ASCII.
+
+    Raises ValueError as `sidecar_text` does, ImageWriteError if the file cannot be written.
+    """
+    write_bytes_atomically(path, sidecar_text(sidecar).encode("ascii"), overwrite)
+
+
+def sidecar_text(sidecar: Sidecar) -> str:
+    """The record as JSON. Equal records give equal texts, and what is read back is equal but for tuples turned lists.
 
     Raises ValueError if the record is not one that could be read again (a number that is not finite, a singular
-    transform, a value that JSON has no word for), ImageWriteError if the file cannot be written.
+    transform, a value that JSON has no word for).
     """
     record = {"format": FORMAT} | {field.name: _plain(getattr(sidecar, field.name)) for field in fields(sidecar)}
     if record["timings_s"] is None:
         del record["timings_s"]
     _sidecar(record)
     # ASCII, because a file's name may hold bytes that are no UTF-8, and these survive only as escapes.
-    text = json.dumps(record, indent=2, ensure_ascii=True, allow_nan=False)
-    write_bytes_atomically(path, (text + "\n").encode("ascii"), overwrite)
+    return json.dumps(record, indent=2, ensure_ascii=True, allow_nan=False) + "\n"
 
 
 def read_sidecar(path: str | Path) -> Sidecar:

@@ -104,7 +104,7 @@ class Alignment:
 
     @property
     def expected_error_px(self) -> float | None:
-        """Mean error to expect over the overlap, px of the fixed picture; None if rejected."""
+        """Mean error to expect over the overlap, px of the fixed picture; None if rejected or not known."""
         return self.best.verdict.expected_error_px
 
     @property
@@ -232,9 +232,8 @@ def _typed(fixed_points: Array, moving_points: Array, sizes: Sizes, options: Ali
         transform = polish(MODELS[model], fit(model, pairs.src, pairs.dst), pairs, sigma_floor=1.0)
     except ValueError as unfit:
         return replace(attempt, verdict=unfit_points(str(unfit)))
-    return replace(
-        attempt, model=model, fixed_from_moving=transform, verdict=judge_typed(transform, pairs, options.verdict, sizes)
-    )
+    verdict = judge_typed(model, transform, pairs, options.verdict, sizes)
+    return replace(attempt, model=model, fixed_from_moving=transform, verdict=verdict)
 
 
 def _attempt(pair: _Pair, rung: Rung, options: AlignOptions) -> Attempt:

@@ -78,7 +78,7 @@ class Verdict:
     status: Status
     reason: str  # one sentence with the numbers
     advice: str  # what would help; empty for an aligned pair
-    expected_error_px: float | None  # mean over the overlap, px of the fixed picture; None if rejected
+    expected_error_px: float | None  # mean over the overlap, px of the fixed picture; None if rejected or not known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,8 +294,13 @@ def unfit_points(reason: str) -> Verdict:
     return Verdict(status="rejected", reason=reason, advice="type more points, spread", expected_error_px=None)
 
 
-def judge_typed(transform: Array, pairs: Correspondences, options: VerdictOptions, sizes: Sizes) -> Verdict:
-    """The verdict on a transform fitted to points that a person typed: how well it fits all of them."""
+def judge_typed(
+    model: ModelName, transform: Array, pairs: Correspondences, options: VerdictOptions, sizes: Sizes
+) -> Verdict:
+    """The verdict on a transform of `model` fitted to points that a person typed: how well it fits all of them.
+
+    As many points as fix the model fit exactly and say nothing of the error.
+    """
     there, _ = project(transform, pairs.src)
     error = _root_mean_square(np.linalg.norm(there - pairs.dst, axis=1))
     anisotropy = _shape(transform, overlap_points(transform, sizes.moving, sizes.fixed))[1]
@@ -304,6 +309,9 @@ def judge_typed(transform: Array, pairs: Correspondences, options: VerdictOption
         return unfit_points(
             f"the {len(pairs)} typed points give a transform that folds or mirrors the picture, or misses it"
         )
+    if len(pairs) == MODELS[model].sample_size:
+        reason = f"fitted to {len(pairs)} typed points, which fix the {model} and leave none to check it"
+        return Verdict(status="aligned", reason=reason, advice="", expected_error_px=None)
     if error > limit:
         reason = f"the {len(pairs)} typed points are off their transform by {error:.1f} px (root mean square)"
         return Verdict(status="doubtful", reason=reason, advice="look for a mistyped point", expected_error_px=error)
