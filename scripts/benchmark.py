@@ -27,7 +27,8 @@ from autoalign.files.write import write_picture
 from autoalign.geometry.homography import project
 from autoalign.picture.pixels import grey, shrink, size_of
 from autoalign.picture.warp import warp
-from autoalign.registration.align import Alignment, align
+from autoalign.registration.align import align
+from autoalign.registration.alignment import Alignment
 
 STAGES = ("detect", "match", "consensus", "refine", "verdict")
 

@@ -24,7 +24,8 @@ from autoalign.files.read import read_picture
 from autoalign.geometry.family import MODELS, fit
 from autoalign.geometry.homography import apply, project
 from autoalign.geometry.least_squares import correspondences, polish
-from autoalign.registration.align import AlignOptions, align
+from autoalign.registration.align import align
+from autoalign.registration.alignment import AlignOptions
 
 
 def related(root: Path) -> list[dict[str, Any]]:
@@ -92,7 +93,8 @@ def caption(image: np.ndarray, seed: int) -> np.ndarray:
     """The picture with a strip of made-up text, the same for the same seed."""
     rng = np.random.default_rng(seed)
     image = np.ascontiguousarray(image if image.ndim == 3 else np.repeat(image[..., None], 3, 2))[..., :3].copy()
-    lines, height = int(rng.integers(1, 4)), int(rng.integers(14, 40))
+    lines = int(rng.integers(1, 4))
+    height = int(rng.integers(12, max(13, image.shape[0] // (6 * lines))))  # a quarter of the picture at most
     strip = lines * height * 3 // 2
     image[-strip:] = rng.integers(0, 2) * 200
     for line in range(lines):

@@ -37,6 +37,10 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "refine",
             "agreement",
             "verdict",
+            "alignment",
+            "typed",
+            "pair",
+            "mirror",
             "align",
             "onto_fixed",
         )
@@ -57,8 +61,8 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "record",
         )
     },
-    {"views": ()},
-    {"cli": ("terminal", "settings", "files", "pair", "rectify", "apply", "main")},
+    {"views": ("words", "evidence", "pictures", "viewer", "window")},
+    {"cli": ("terminal", "settings", "files", "view", "pair", "rectify", "apply", "main")},
 )
 
 # Where a package outside the standard library may be imported. NumPy is everywhere.
@@ -74,12 +78,13 @@ HOMES: dict[str, tuple[str, ...]] = {
         "registration.agreement",
         "files.record",  # its version only
     ),
-    "cyclopts": ("cli.terminal", "cli.settings", "cli.pair", "cli.rectify", "cli.apply", "cli.main"),
+    "cyclopts": ("cli.terminal", "cli.settings", "cli.pair", "cli.rectify", "cli.apply", "cli.view", "cli.main"),
     "imagecodecs": ("files.png",),
     "lazy_loader": ("",),
+    "rerun": ("views.viewer",),
     "rich": ("cli.terminal",),
     "simplejpeg": ("files.jpeg",),
-    "skimage": ("registration.align",),  # its ProjectiveTransform, for those who live there
+    "skimage": ("registration.alignment",),  # its ProjectiveTransform, for those who live there
     "tifffile": ("files.tiff",),
 }
 

@@ -19,10 +19,9 @@ from .picture.canvas import canvas as canvas
 from .picture.canvas import plane_canvas as plane_canvas
 from .picture.compose import compose as compose
 from .picture.warp import warp as warp
-from .registration.align import Alignment as Alignment
-from .registration.align import AlignOptions as AlignOptions
 from .registration.align import align as align
-from .registration.align import align_points as align_points
+from .registration.alignment import Alignment as Alignment
+from .registration.alignment import AlignOptions as AlignOptions
 from .registration.features import FeatureOptions as FeatureOptions
 from .registration.features import detect as detect
 from .registration.matching import MatchOptions as MatchOptions
@@ -30,6 +29,8 @@ from .registration.matching import match as match
 from .registration.onto_fixed import warp_onto_fixed as warp_onto_fixed
 from .registration.refine import RefineOptions as RefineOptions
 from .registration.refine import refine as refine
+from .registration.typed import align_points as align_points
 from .registration.verdict import VerdictOptions as VerdictOptions
+from .views.viewer import log_alignment as log_alignment
 
 __version__: str

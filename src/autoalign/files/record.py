@@ -15,7 +15,7 @@ from autoalign import __version__
 from autoalign.files.read import LoadedPicture
 from autoalign.files.sidecar import PictureRecord, Sidecar, as_shown
 from autoalign.picture.pixels import size_of
-from autoalign.registration.align import Alignment
+from autoalign.registration.alignment import Alignment
 
 
 def record(

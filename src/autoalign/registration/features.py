@@ -42,6 +42,8 @@ class FeatureOptions:
     """sift: compare square roots of the histograms (RootSIFT)"""
     tilts: tuple[float, ...] = ()
     """look at the picture as from the side too, squeezed by these factors (ASIFT)"""
+    equalise: bool = False
+    """even out the contrast of every part of the picture first (CLAHE)"""
 
     def __post_init__(self) -> None:
         if self.detector not in DETECTORS or self.working_pixels < 1 or self.max_features < 1 or self.contrast <= 0:
@@ -69,15 +71,29 @@ def detect(image: NDArray[np.uint8], options: FeatureOptions, valid: Mask | None
     Arandjelovic and Zisserman 2012 (RootSIFT); Lowe 2004; Rublee et al. 2011.
     """
     small = shrink(image, options.working_pixels)
-    mask = None if valid is None else _shrink_mask(valid, size_of(small.pixels))
+    pixels = cv2.createCLAHE(4.0, (8, 8)).apply(small.pixels) if options.equalise else small.pixels
+    mask = None if valid is None else _shrink_mask(valid, size_of(pixels))
     find = _sift if options.detector == "sift" else _orb
     found = []
-    for view in views(small.pixels, mask, options.tilts):
+    for view in views(np.asarray(pixels, np.uint8), mask, options.tilts):
         share = replace(options, max_features=max(1, round(options.max_features / view.tilt)))
         found.append(
             _in_full_pixels(find(view.pixels, share, view.mask), small.full_from_small @ view.picture_from_view)
         )
     return found[0] if len(found) == 1 else _pooled(found)
+
+
+def with_reversed_contrast(features: Features) -> Features:
+    """The SIFT features, and each as it would be found in the picture's negative.
+
+    A negative turns every gradient round, and with them the keypoint's own angle: the histograms of the 4 x 4 cells
+    stay as they are, but the cells change places by half a turn.
+    """
+    if features.detector != "sift":
+        raise ValueError(f"only features of sift can have their contrast reversed, not those of {features.detector}")
+    cells = features.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, ::-1]
+    negative = replace(features, descriptors=cells.reshape(-1, 128), angles=features.angles + np.pi)
+    return _pooled([features, negative])
 
 
 def _shrink_mask(valid: Mask, size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -21,6 +21,7 @@ class Rung:
     matching: MatchOptions
     enough_px: float = float("inf")  # an aligned pair with a greater expected error climbs on
     on_a_hint: bool = False  # climbed only after a consensus that is not quite chance
+    either_contrast: bool = False  # a keypoint may match its own negative
 
 
 _ORB = Rung(
@@ -46,6 +47,13 @@ _VIEWS = Rung(
     matching=MatchOptions(ratio=0.9),
     on_a_hint=True,
 )
+_OTHER_LIGHT = Rung(
+    name="sift in other light, either contrast",
+    features=FeatureOptions(detector="sift", working_pixels=0.5e6, max_features=4000, contrast=0.01, equalise=True),
+    matching=MatchOptions(ratio=0.95),
+    on_a_hint=True,
+    either_contrast=True,
+)
 _MORE_ORB = Rung(
     name="orb at 2 MP",
     features=FeatureOptions(detector="orb", working_pixels=2e6, max_features=8000),
@@ -54,8 +62,8 @@ _MORE_ORB = Rung(
 
 LADDER: dict[Effort, tuple[Rung, ...]] = {
     "fast": (_ORB,),
-    "normal": (_ORB, _SIFT, _VIEWS, _MORE_SIFT),
-    "max": tuple(replace(rung, on_a_hint=False) for rung in (_ORB, _SIFT, _VIEWS, _MORE_SIFT)),
+    "normal": (_ORB, _SIFT, _VIEWS, _MORE_SIFT, _OTHER_LIGHT),
+    "max": tuple(replace(rung, on_a_hint=False) for rung in (_ORB, _SIFT, _VIEWS, _MORE_SIFT, _OTHER_LIGHT)),
 }
 _ONLY_ORB: dict[Effort, tuple[Rung, ...]] = {"fast": (_ORB,), "normal": (_ORB, _MORE_ORB), "max": (_ORB, _MORE_ORB)}
 

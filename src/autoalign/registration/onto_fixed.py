@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from autoalign.picture.pixels import Picture
 from autoalign.picture.warp import Interpolation, warp
-from autoalign.registration.align import Alignment
+from autoalign.registration.alignment import Alignment
 
 
 def warp_onto_fixed(

@@ -62,7 +62,7 @@ def _view(image: NDArray[np.uint8], mask: NDArray[np.uint8] | None, tilt: float,
 
 
 def _turned(size: tuple[int, int], turn: float) -> tuple[Array, tuple[int, int]]:
-    """`turned_from_picture` of a turn that keeps a whole picture of `size` (w, h) in view, and the size that it takes."""
+    """`turned_from_picture` of a turn that keeps a picture of `size` (w, h) whole, and the size that it takes."""
     cosine, sine = np.cos(turn), np.sin(turn)
     rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     corners = np.array([[0, 0], [size[0] - 1, 0], [0, size[1] - 1], [size[0] - 1, size[1] - 1]]) @ rotation[:2, :2].T
