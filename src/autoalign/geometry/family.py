@@ -1,4 +1,4 @@
-"""The family of models: identity, translation, rigid, similarity, affine, homography, from the simplest to the most general.
+"""The family of models: identity, translation, rigid, similarity, affine, homography, each more general than the last.
 
 Each is a group of transforms and a subgroup of the next, so one table says all there is to know of a model: how many
 points fix it, how to solve it from points, and the directions (generators of its Lie algebra) in which it can move,
@@ -14,7 +14,17 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from autoalign.geometry.homography import Array, Mask, as_points, dlt, four_point, project, unit
+from autoalign.geometry.homography import (
+    IDENTITY,
+    Array,
+    Mask,
+    as_points,
+    dlt,
+    four_point,
+    normalisation,
+    project,
+    unit,
+)
 
 ModelName = Literal["identity", "translation", "rigid", "similarity", "affine", "homography"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)
@@ -29,9 +39,7 @@ class Model:
     name: ModelName
     sample_size: int  # points that fix it
     generators: Array  # (dof, 3, 3): small moves are identity + sum of parameter x generator
-    solve: (
-        _Solver  # weighted least squares: src, dst (k, n, 2), weights (k, n) -> (k, 3, 3); exact for a minimal sample
-    )
+    solve: _Solver  # weighted least squares: src, dst (k, n, 2), weights (k, n) -> (k, 3, 3); nan where not fixed
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -85,10 +93,16 @@ def _solve_similarity(src: Array, dst: Array, weights: Array) -> Array:
 def _solve_affine(src: Array, dst: Array, weights: Array) -> Array:
     w, src_mean, dst_mean, s, d = _about_means(src, dst, weights)
     cross = np.einsum("...ni,...nj->...ij", w * d, s)
-    (a, b), (_, c) = (np.moveaxis(np.einsum("...ni,...nj->...ij", w * s, s), (-2, -1), (0, 1))[i] for i in range(2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.stack([np.stack([c, -b], -1), np.stack([-b, a], -1)], -2) / (a * c - b * b)[..., None, None]
-    return _assemble(np.einsum("...ij,...jk->...ik", cross, inverse), src_mean, dst_mean)
+    scatter = np.einsum("...ni,...nj->...ij", w * s, s)
+    inverse = np.linalg.inv(np.where(_singular(scatter), np.eye(2), scatter))
+    linear = np.einsum("...ij,...jk->...ik", cross, inverse)
+    return _assemble(np.where(_singular(scatter) | _singular(linear), np.nan, linear), src_mean, dst_mean)
+
+
+def _singular(matrix: Array) -> Mask:
+    """(..., 1, 1) True where a (..., 2, 2) matrix flattens the plane to a line, but for rounding."""
+    a, b, c, d = np.moveaxis(matrix.reshape(*matrix.shape[:-2], 4), -1, 0)
+    return np.asarray(np.abs(a * d - b * c) <= 1e-12 * (a**2 + b**2 + c**2 + d**2))[..., None, None]
 
 
 def _solve_homography(src: Array, dst: Array, weights: Array) -> Array:
@@ -145,11 +159,18 @@ def solve_samples(model: Model, src: Array, dst: Array, min_area: float = 1e-9) 
     if model.name == "homography":
         return four_point(src, dst, min_area)
     transforms = model.solve(src, dst, np.ones(src.shape[:-1]))
-    sound = np.isfinite(transforms).all((-2, -1))
-    transforms[~sound] = np.eye(3)
-    # A collapsed picture is as degenerate as an undetermined one.
-    sound &= np.abs(np.linalg.det(transforms[..., :2, :2])) > min_area * transforms[..., 2, 2] ** 2
+    sound = _spread(src, min_area) & _spread(dst, min_area) & np.isfinite(transforms).all((-2, -1))
+    transforms[~sound] = unit(IDENTITY)
     return transforms, sound
+
+
+def _spread(points: Array, min_area: float) -> Mask:
+    """(k,) False where two of up to three points (k, m, 2) repeat, or three are nearly collinear, as in four_point."""
+    p = points * normalisation(points)[:, :1, :1]
+    if p.shape[1] < 3:
+        return np.asarray((p[:, 1:] != p[:, :1]).any(-1).all(-1))
+    u, v = np.moveaxis(p[:, 1:] - p[:, :1], (1, 2), (0, 1))
+    return np.asarray(np.abs(u[0] * v[1] - u[1] * v[0]) >= min_area)
 
 
 def fit(model: ModelName, src: ArrayLike, dst: ArrayLike, weights: ArrayLike | None = None) -> Array:
@@ -164,5 +185,6 @@ def fit(model: ModelName, src: ArrayLike, dst: ArrayLike, weights: ArrayLike | N
     w = np.ones(len(src)) if weights is None else np.asarray(weights, np.float64)
     transform: Array = member.solve(src[None], dst[None], w[None])[0]
     if not np.isfinite(transform).all() or not (project(transform, src)[1] > 0).any():
-        raise ValueError(f"the points do not fix the model {model}: too many of them are collinear or repeat")
+        order = ", or go round in another order" if model == "homography" else ""
+        raise ValueError(f"the points do not fix the model {model}: too many of them are collinear or repeat{order}")
     return transform

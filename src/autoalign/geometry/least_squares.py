@@ -53,11 +53,11 @@ def velocities(model: Model, points: Array, norm: Array) -> Array:
 
     The normalisation is a similarity, which maps every model of the family onto itself; it only conditions the numbers.
     """
-    scale = norm[0, 0]
-    u = points * scale + norm[:2, 2]
-    homogeneous = np.concatenate([u, np.ones((len(u), 1))], axis=1)
-    moved = np.einsum("gij,nj->nig", model.generators, homogeneous)
-    return np.asarray((moved[:, :2] - u[:, :, None] * moved[:, 2:]) / scale)
+    # Points last in memory, (dof, 2, n), is what makes the sums over them fast.
+    scale, g = norm[0, 0], model.generators[..., None]
+    u = points.T * scale + norm[:2, 2:]
+    moved = g[:, :, 0] * u[0] + g[:, :, 1] * u[1] + g[:, :, 2]
+    return np.asarray((moved[:, :2] - u * moved[:, 2:]) / scale).T
 
 
 def step(model: Model, transform: Array, parameters: Array, norm: Array) -> Array:
@@ -77,36 +77,30 @@ def step(model: Model, transform: Array, parameters: Array, norm: Array) -> Arra
 
 @dataclass(frozen=True, kw_only=True)
 class _Linearised:
-    forward: Array  # (n, 2) residuals in sigmas
-    backward: Array  # (n, 2)
-    forward_slope: Array  # (n, 2, dof) of the projected src, in sigmas
-    backward_slope: Array  # (n, 2, dof)
+    """Residuals and their derivatives; points last in memory, so that sums over them are fast."""
+
+    residual: Array  # (4, n) in sigmas: forward x and y, backward x and y
+    slope: Array  # (dof, 4, n) of what the residuals are taken from: the projected src, dst taken back
 
     @property
     def error_squared(self) -> Array:
-        return np.asarray(0.5 * ((self.forward**2).sum(1) + (self.backward**2).sum(1)))
+        return np.asarray(0.5 * (self.residual**2).sum(0))
 
 
-def _residuals(transform: Array, pairs: Correspondences) -> tuple[Array, Array, Array]:
-    """Forward and backward residuals (n, 2) in sigmas, and dst taken back to the src plane (n, 2)."""
-    projected, _ = project(transform, pairs.src)
+def _linearise(model: Model, transform: Array, pairs: Correspondences, norm: Array, src_velocity: Array) -> _Linearised:
+    there, _ = project(transform, pairs.src)
     back, _ = project(invert(transform), pairs.dst)
-    return (pairs.dst - projected) / pairs.dst_sigma[:, None], (pairs.src - back) / pairs.src_sigma[:, None], back
-
-
-def _linearise(model: Model, transform: Array, pairs: Correspondences, norm: Array) -> _Linearised:
-    forward, backward, back = _residuals(transform, pairs)
-    forward_slope = np.einsum("nij,njg->nig", jacobian(transform, pairs.src), velocities(model, pairs.src, norm))
+    by_x, by_y = jacobian(transform, pairs.src).T
+    there_slope = by_x * src_velocity[:, :1] + by_y * src_velocity[:, 1:]
+    back_slope = -velocities(model, back, norm).T
     return _Linearised(
-        forward=forward,
-        backward=backward,
-        forward_slope=forward_slope / pairs.dst_sigma[:, None, None],
-        backward_slope=-velocities(model, back, norm) / pairs.src_sigma[:, None, None],
+        residual=np.concatenate([(pairs.dst - there).T / pairs.dst_sigma, (pairs.src - back).T / pairs.src_sigma]),
+        slope=np.concatenate([there_slope / pairs.dst_sigma, back_slope / pairs.src_sigma], axis=1),
     )
 
 
 def robust_scale(error_squared: Array, floor: float) -> float:
-    """Sigma of a coordinate from the median of squared 2-D errors (Rayleigh: median = 1.1774 sigma), never under `floor`."""
+    """Sigma of a coordinate from the median of squared 2-D errors (Rayleigh: 1.1774 sigma), never under `floor`."""
     return max(float(np.sqrt(np.median(error_squared))) / 1.1774, floor)
 
 
@@ -122,10 +116,8 @@ def _tukey_cost(error_squared: Array, sigma: float) -> float:
 
 def _normal_equations(at: _Linearised, weights: Array) -> tuple[Array, Array]:
     """(dof, dof) and (dof,): einsum without BLAS, so that the bits do not depend on the number of threads."""
-    slope = np.concatenate([at.forward_slope, at.backward_slope], axis=1)
-    residual = np.concatenate([at.forward, at.backward], axis=1)
-    weighted = slope * weights[:, None, None]
-    return np.einsum("nri,nrj->ij", weighted, slope), np.einsum("nri,nr->i", weighted, residual)
+    slope, weighted = (a.reshape(len(at.slope), -1) for a in (at.slope, at.slope * weights))
+    return np.einsum("gk,hk->gh", weighted, slope), np.einsum("gk,k->g", weighted, at.residual.ravel())
 
 
 def polish(
@@ -141,7 +133,8 @@ def polish(
         return transform
     norm = normalisation(pairs.src)
     damping = 1e-3
-    at = _linearise(model, transform, pairs, norm)
+    src_velocity = velocities(model, pairs.src, norm).T
+    at = _linearise(model, transform, pairs, norm, src_velocity)
     for _ in range(max_steps):
         error = at.error_squared
         if not np.isfinite(error).all():
@@ -155,7 +148,7 @@ def polish(
         except np.linalg.LinAlgError:
             return transform
         candidate = step(model, transform, parameters, norm)
-        then = _linearise(model, candidate, pairs, norm)
+        then = _linearise(model, candidate, pairs, norm, src_velocity)
         if _tukey_cost(then.error_squared, sigma) > cost or not np.isfinite(then.error_squared).all():
             damping *= 10.0
             if damping > 1e6:

@@ -24,13 +24,16 @@ from autoalign.geometry.homography import (
     determinant,
     symmetric_transfer_error_squared,
     transfer_error_squared,
+    turn,
     unit,
 )
 from autoalign.geometry.least_squares import Correspondences, polish
 
 _GROWTH = 200_000  # draws after which PROSAC has become plain RANSAC, at most (T_N in the paper)
 _FIRST_BATCH = 100  # samples; a good pair needs no more
+_LOCAL_STEPS = 2  # of least squares per threshold: settle() goes on to the minimum
 _FEW = 10  # hypotheses of a batch that are judged both ways
+_CACHED = 16_384  # errors computed at once: more would leave the processor's cache
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +44,7 @@ class RansacOptions:
     """a match agrees if its symmetric transfer error is under so many sigmas"""
     confidence: float = 0.999
     """stop when a larger consensus is this improbable to have been missed"""
-    max_trials: int = 20_000
+    max_trials: int = 40_000
     """samples drawn, at most"""
     batch: int = 2_000
     """samples drawn and judged together, at most: each batch is as large as all before it"""
@@ -113,20 +116,16 @@ def _search(model: Model, pairs: Correspondences, options: RansacOptions) -> tup
     n, m, limit = len(pairs), model.sample_size, options.threshold**2
     most = min(options.max_trials, _trials_to_draw_all(n, m, options.confidence))
     tops, growing = _prosac_order(n, m, most)
-    best, best_cost, wide_best = None, n * limit, n*limit*_WIDE
+    best, best_cost = None, n * limit
     drawn, needed = 0, most
     while drawn < needed:
         batch = slice(drawn, drawn + min(max(drawn, _FIRST_BATCH), options.batch))
         drawn = min(batch.stop, most)
         samples = _draw(rng, tops[batch], growing[batch], m)
         candidate, cost = _best_of(_hypotheses(model, pairs, samples), pairs, limit)
-        if candidate is None or cost >= wide_best:
+        if candidate is None or cost >= best_cost:
             continue
-        wide_best=cost
-        cost = np.minimum(_errors_squared(candidate, pairs), limit).sum()
-        new,new_cost = _optimise_locally(model, candidate, cost, pairs, options.threshold)
-        if new_cost>=best_cost: continue
-        best,best_cost=new,new_cost
+        best, best_cost = _optimise_locally(model, candidate, cost, pairs, options.threshold)
         inliers = _errors_squared(best, pairs) < limit
         needed = min(needed, _trials_needed(inliers, tops, m, options.confidence))
     return best, drawn
@@ -134,7 +133,7 @@ def _search(model: Model, pairs: Correspondences, options: RansacOptions) -> tup
 
 def _trials_to_draw_all(n: int, m: int, confidence: float) -> int:
     """Draws of m out of n, with repeats, that leave out a given sample with a chance under 1 - confidence."""
-    return ceil(-log(1 - confidence) * n**m / factorial(m))
+    return ceil(-log(1 - confidence) * float(n) ** m / factorial(m))
 
 
 def _prosac_order(n: int, m: int, trials: int) -> tuple[NDArray[np.int64], Mask]:
@@ -164,22 +163,30 @@ def _draw(rng: np.random.Generator, tops: NDArray[np.int64], growing: Mask, m: i
 
 def _hypotheses(model: Model, pairs: Correspondences, samples: NDArray[np.int64]) -> Array:
     """(k, 3, 3) the transforms of the sound samples that do not mirror."""
-    transforms, sound = solve_samples(model, pairs.src[samples], pairs.dst[samples], min_area=1e-3)
+    src, dst = (np.take(points, samples, axis=0) for points in (pairs.src, pairs.dst))
+    if model.sample_size >= 3:
+        # A triangle that turns over spares the solving of half of the random samples.
+        kept = turn(*np.moveaxis(src[:, :3], 1, 0)) * turn(*np.moveaxis(dst[:, :3], 1, 0)) > 0
+        src, dst = src[kept], dst[kept]
+    transforms, sound = solve_samples(model, src, dst, min_area=1e-3)
     return transforms[sound & (determinant(transforms) > 0)]
 
 
-_WIDE=1.0
 def _best_of(hypotheses: Array, pairs: Correspondences, limit: float) -> tuple[Array | None, float]:
     """The hypothesis of least MSAC cost: all are judged one way, the best few both ways."""
     if not len(hypotheses):
         return None, np.inf
-    limit=limit*_WIDE
-    one_way = transfer_error_squared(hypotheses, pairs.src, pairs.dst) / pairs.dst_sigma**2
-    rough = np.minimum(one_way, limit).sum(-1)
+    parts = np.array_split(hypotheses, len(hypotheses) * len(pairs) // _CACHED + 1)
+    rough = np.concatenate([_one_way_cost(part, pairs, limit) for part in parts])
     few = hypotheses[np.argsort(rough, kind="stable")[:_FEW]]
     costs = np.minimum(_errors_squared(few, pairs), limit).sum(-1)
     chosen = int(np.argmin(costs))
     return few[chosen], float(costs[chosen])
+
+
+def _one_way_cost(hypotheses: Array, pairs: Correspondences, limit: float) -> Array:
+    error = transfer_error_squared(hypotheses, pairs.src, pairs.dst) / pairs.dst_sigma**2
+    return np.asarray(np.minimum(error, limit).sum(-1))
 
 
 def _optimise_locally(
@@ -191,7 +198,7 @@ def _optimise_locally(
         inliers = _errors_squared(transform, pairs) < (factor * threshold) ** 2
         if inliers.sum() <= model.sample_size:
             break
-        transform = polish(model, transform, pairs[inliers], max_steps=5)
+        transform = polish(model, transform, pairs[inliers], max_steps=_LOCAL_STEPS)
         now = float(np.minimum(_errors_squared(transform, pairs), threshold**2).sum())
         if now < best_cost:
             best, best_cost = transform, now

@@ -1,7 +1,7 @@
 """Which model of the family explains the correspondences: the simplest that fits no worse than chance allows.
 
-Source: Schwarz 1978 (BIC), with a robust error, in the spirit of Torr's GRIC (1998). The scale of the noise is taken from
-the most general model.
+Source: Schwarz 1978 (BIC), with a robust error, in the spirit of Torr's GRIC (1998). The scale of the noise is taken
+from the most general model.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ def _systematic(points: Array, residuals: Array, weights: Array) -> float:
 
 
 def point_errors(model: Model, dst_from_src: Array, known: Uncertainty, points: Array) -> Array:
-    """(n,) mean distance in dst px by which the projections of src `points` (n, 2) are off, from the covariance alone."""
+    """(n,) mean distance in dst px by which projections of src `points` (n, 2) are off, from the covariance alone."""
     slope = np.einsum("nij,njg->nig", jacobian(dst_from_src, points), velocities(model, points, known.norm))
     variance = np.einsum("nig,gh,nih->n", slope, known.covariance, slope)
     return np.asarray(_MEAN_OF_LENGTH * np.sqrt(np.maximum(variance, 0.0)))
