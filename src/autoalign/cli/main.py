@@ -41,10 +41,21 @@ burst. They stay as they are; the results lie on FIXED. A doubtful pair is appli
 
 Exit code: 0 done, 1 the pair was rejected, 2 wrong usage, 3 a file could not be read or written.
 """,
+    "view": """\
+Open the viewer on recordings that `autoalign pair --save-rrd` made.
+
+The record of a pair stands for the recording beside it, <output stem>.autoalign.rrd. The viewer can be reached from \
+this machine only.
+
+Exit code: 0 done, 2 wrong usage, 3 a file could not be read, or there is no display.
+""",
 }
 """Command to help text, whose first line `autoalign --help` shows; each lives in the module of its name."""
 
-USAGE = {"apply": "Usage: autoalign apply [OPTIONS] SIDECAR [IMAGES...]"}  # what cannot be told from the signature
+USAGE = {
+    "apply": "Usage: autoalign apply [OPTIONS] SIDECAR [IMAGES...]",
+    "view": "Usage: autoalign view [OPTIONS] FILE.rrd|SIDECAR...",
+}  # what cannot be told from the signature
 
 EPILOGUE = """\
 Every option can also be set as AUTOALIGN_<OPTION> in the environment or in an autoalign.toml here or in a folder \

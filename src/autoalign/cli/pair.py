@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from autoalign.cli.files import SCREEN_PIXEL, check_outputs, read_sized
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
+from autoalign.cli.view import Viewing, check_viewing, show
 from autoalign.files.points import CORRESPONDENCES, read_points
 from autoalign.files.read import LoadedPicture, read_picture
 from autoalign.files.record import record
@@ -24,8 +25,10 @@ from autoalign.picture.canvas import CanvasKind, canvas
 from autoalign.picture.compose import STYLES, compose
 from autoalign.picture.pixels import grey, size_of
 from autoalign.picture.warp import warp
-from autoalign.registration.align import Alignment, AlignOptions, align, align_points
+from autoalign.registration.align import align
+from autoalign.registration.alignment import Alignment, AlignOptions
 from autoalign.registration.refine import RefineOptions
+from autoalign.registration.typed import align_points
 from autoalign.registration.verdict import VerdictOptions
 
 # One flag per field of every stage, under the field's own name and a heading of the stage's.
@@ -66,6 +69,7 @@ def pair(
     /,
     *,
     files: Annotated[PairFiles, Parameter(name="*", group=FILES)] = PairFiles(),
+    viewing: Annotated[Viewing, Parameter(name="*", group=Group("Viewer", sort_key=1.5))] = Viewing(),
     options: Annotated[AlignOptions, Parameter(name="*", group=Group("Alignment", sort_key=2))] = AlignOptions(),
     common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
 ) -> int:
@@ -82,8 +86,9 @@ def pair(
     still, mover = read_picture(fixed), read_picture(moving)
     output = files.output or default_output(moving, mover.pixels)
     sidecar = None if files.json == STDOUT else files.json or default_sidecar(output)
+    recording = check_viewing(viewing, sidecar or default_sidecar(output))
     check_outputs(
-        [(output, mover.pixels), (files.overlay, SCREEN_PIXEL), (sidecar, None)],
+        [(output, mover.pixels), (files.overlay, SCREEN_PIXEL), (sidecar, None), (recording, None)],
         inputs=[fixed, moving, files.points, files.fixed_mask, files.moving_mask],
         overwrite=common.overwrite,
     )
@@ -106,6 +111,8 @@ def pair(
         note(f"left as it was, from an earlier run: {output}", common)
     if written:
         note(f"wrote {', '.join(map(str, written))}", common)
+    if viewing:
+        show(alignment, (still, mover), viewing, recording, timings=files.timings, common=common)
     return Exit.DONE if alignment.status == "aligned" else Exit.NOT_ALIGNED
 
 

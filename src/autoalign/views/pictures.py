@@ -1,0 +1,149 @@
+"""Pictures as a viewer can hold them: a file's own bytes where they will do, else encoded, and both in one frame."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from autoalign.files.formats import HEAD_BYTES, JPEG, PNG, Format, decoder_for, encoder_for, of_bytes
+from autoalign.files.metadata import Metadata
+from autoalign.files.read import LoadedPicture
+from autoalign.geometry.homography import Array, jacobian
+from autoalign.geometry.uncertainty import overlap_points
+from autoalign.picture.compose import compose
+from autoalign.picture.pixels import Picture, has_alpha, shrink, size_of, to_8_bit
+from autoalign.picture.warp import warp
+
+MAX_SIDE = 8192  # px; the textures of many a graphics card and of every browser end here
+LAYER_PIXELS = 2.2e6  # of the pictures of both in one frame: what a large screen shows, a few hundred kilobytes each
+QUALITY = 85  # of JPEGs made here: no artefact that could be taken for a misalignment
+_TINT = np.array([70.0, 150.0, 255.0])  # of the moving picture's squares of the checkerboard
+_TINTED = 0.22
+
+_MEDIA_TYPES: dict[Format, str] = {JPEG: "image/jpeg", PNG: "image/png"}  # all that the viewer decodes
+
+_Pixels = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoded:
+    """The bytes of a picture that a viewer can decode."""
+
+    data: bytes
+    media_type: str
+    size: tuple[int, int]  # (w, h) of the picture in the bytes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """One picture for a viewer, and what a person must know about how it is shown."""
+
+    picture: Encoded
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layers:
+    """Both pictures in the frame of the fixed one, which is shrunken where it is large."""
+
+    size: tuple[int, int]  # (w, h) of all of them
+    fixed: Encoded | None  # None where the picture itself, as it is shown, serves
+    moving: Encoded  # and the fixed one where the moving one has no data, so that blending changes the overlap alone
+    checkerboard: Encoded  # the moving one's squares are tinted
+    green_magenta: Encoded  # fixed in green, moving in magenta, grey where they agree
+    difference: Encoded
+
+
+def original_bytes(loaded: LoadedPicture) -> bytes | None:
+    """The file's bytes, if they still are those that were read."""
+    try:
+        data = loaded.path.read_bytes()
+    except OSError:
+        return None
+    return data if hashlib.sha256(data).hexdigest() == loaded.sha256 else None
+
+
+def as_shown(picture: Picture, name: str, original: bytes | None = None) -> Shown:
+    """A picture at its full size, if the viewer can hold that. `original` are the bytes of the file it was read from,
+    which are taken as they are where a viewer makes the same picture of them."""
+    kept = None if original is None else _kept(picture, original)
+    if kept is not None:
+        return Shown(picture=kept)
+    w, h = size_of(picture)
+    smaller = shrink(picture, min(1.0, MAX_SIDE / max(w, h)) ** 2 * w * h).pixels
+    notes = []
+    if size_of(smaller) != (w, h):
+        notes.append(f"{name} is shown at {smaller.shape[1]} × {smaller.shape[0]}, its full size is {w} × {h}")
+    if picture.dtype != np.uint8:
+        notes.append(f"{name} has {picture.dtype} pixels, whose range is stretched to what a screen shows")
+    colours = smaller[..., :-1] if has_alpha(smaller) else smaller
+    return Shown(picture=_encoded(to_8_bit(colours)), notes=tuple(notes))
+
+
+def layers(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> Layers | None:
+    """Both pictures in one frame under a transform (3, 3), whatever the verdict on it; None if it has no inverse."""
+    if np.linalg.matrix_rank(fixed_from_moving) < 3:
+        return None
+    still = shrink(fixed, LAYER_PIXELS)
+    mover = shrink(moving, moving.shape[0] * moving.shape[1] / _squeeze(fixed, moving, fixed_from_moving) ** 2)
+    small_from_fixed = np.linalg.inv(still.full_from_small)
+    moved = warp(mover.pixels, size_of(still.pixels), small_from_fixed @ fixed_from_moving @ mover.full_from_small)
+    everywhere = np.ones(moved.valid.shape, bool)
+    # Side by side they have become alike, 8-bit and free of alpha.
+    both = _rgb(compose("side-by-side", still.pixels, moved.pixels, everywhere, moved.valid))
+    a, b = both[:, : both.shape[1] // 2], both[:, both.shape[1] // 2 :]
+    valid = moved.valid if not has_alpha(moved.pixels) else moved.valid & (moved.pixels[..., -1] > 0)
+
+    def drawn(style: str, moving_pixels: _Pixels = b) -> _Pixels:
+        return compose(style, a, moving_pixels, everywhere, valid)
+
+    return Layers(
+        size=size_of(still.pixels),
+        fixed=None if still.pixels is fixed and fixed.dtype == np.uint8 else _encoded(a),
+        moving=_encoded(np.where(valid[..., None], b, a)),
+        checkerboard=_encoded(drawn("checkerboard", _tinted(b))),
+        green_magenta=_encoded(drawn("red-cyan")[..., [1, 0, 1]]),
+        difference=_encoded(drawn("difference")),
+    )
+
+
+def _kept(picture: Picture, original: bytes) -> Encoded | None:
+    """The original bytes if a viewer that knows neither orientations nor 16 bits makes this picture of them."""
+    format = of_bytes(original[:HEAD_BYTES])
+    if format not in _MEDIA_TYPES or picture.dtype != np.uint8 or max(size_of(picture)) > MAX_SIDE:
+        return None
+    header = decoder_for(format, 0).read_header(original)
+    if header.orientation != 1 or header.size != size_of(picture):
+        return None
+    return Encoded(data=original, media_type=_MEDIA_TYPES[format], size=header.size)
+
+
+def _encoded(pixels: _Pixels) -> Encoded:
+    grey = pixels[..., 0] if pixels.shape[2:] == (1,) else pixels
+    data = encoder_for(JPEG, QUALITY)(grey, Metadata())
+    return Encoded(data=data, media_type=_MEDIA_TYPES[JPEG], size=size_of(pixels))
+
+
+def _squeeze(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> float:
+    """How many times the moving picture is shrunken on its way into the layers' frame, 1 to 64.
+
+    What bilinear sampling would skip must be averaged before, or fine detail would look like disagreement.
+    """
+    w, h = size_of(fixed)
+    inside = overlap_points(fixed_from_moving, size_of(moving), (w, h))
+    if not len(inside):
+        return 1.0
+    zoom = float(np.median(np.sqrt(np.abs(np.linalg.det(jacobian(fixed_from_moving, inside))))))
+    return float(np.clip(max(1.0, (w * h / LAYER_PIXELS) ** 0.5) / max(zoom, 1e-6), 1.0, 64.0))
+
+
+def _rgb(pixels: _Pixels) -> _Pixels:
+    return np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels
+
+
+def _tinted(pixels: _Pixels) -> _Pixels:
+    mixed = pixels * np.float32(1 - _TINTED) + (_TINT * _TINTED).astype(np.float32)
+    return np.asarray(np.rint(mixed), np.uint8)
