@@ -233,13 +233,14 @@ def _log_matches(recording: rr.RecordingStream, scene: _Scene) -> None:
     all_of_them = (np.flatnonzero(seen.inliers), np.flatnonzero(outlier))
     drawn = (legible(seen.fixed, seen.inliers, size, LINES), legible(seen.fixed, outlier, size, few))
     for path, (agreeing, rejected) in (("matches", all_of_them), ("matches/drawn", drawn)):
-        residuals = rr.AnyValues(residual_px=_finite(seen.residuals_px[agreeing]))
-        _log(recording, f"{path}/inliers", _lines(seen, agreeing, scene.place, seen.colours[agreeing], 1.1), residuals)
+        lines = _lines(seen, agreeing, scene.place, seen.colours[agreeing], 1.1)
+        _log(recording, f"{path}/inliers", lines, *_told("residual_px", seen.residuals_px[agreeing]))
         _log(recording, f"{path}/outliers", _lines(seen, rejected, scene.place, _DARK_RED, 0.6))
 
 
-def _finite(values: Array) -> NDArray[np.float32]:
-    return np.nan_to_num(values, nan=-1.0, posinf=-1.0).astype(np.float32)
+def _told(name: str, values: Array) -> list[rr.AnyValues]:
+    """Numbers (n,) that the viewer tells of the mark under the mouse; rerun refuses none at all."""
+    return [rr.AnyValues(**{name: values.astype(np.float32)})] if len(values) else []
 
 
 def _lines(
@@ -296,7 +297,7 @@ def _log_patches(recording: rr.RecordingStream, patches: Patches) -> None:
         points = rr.Points2D(
             _at(patches.pairs.dst[compared]), colors=patch_colours(correlation), radii=rr.Radius.ui_points(2.6)
         )
-        _log(recording, f"patches/{name}", points, rr.AnyValues(correlation=correlation.astype(np.float32)))
+        _log(recording, f"patches/{name}", points, *_told("correlation", correlation))
 
 
 def _log_pictures(recording: rr.RecordingStream, scene: _Scene) -> None:

@@ -1,0 +1,137 @@
+"""What a viewer is given to decode."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from skimage import data
+
+import autoalign as aa
+from autoalign.files.jpeg import decoder
+from autoalign.files.metadata import Metadata
+from autoalign.files.read import LoadedPicture
+from autoalign.files.write import write_picture
+from autoalign.geometry.homography import IDENTITY, translation
+from autoalign.views import pictures
+from autoalign.views.pictures import MAX_SIDE, Encoded, as_shown, layers, original_bytes
+
+
+def decoded(picture: Encoded) -> np.ndarray:
+    assert picture.media_type == "image/jpeg"
+    pixels = decoder().decode(picture.data)
+    assert (pixels.shape[1], pixels.shape[0]) == picture.size
+    return pixels.astype(float)
+
+
+@pytest.fixture
+def photo() -> np.ndarray:
+    return data.coffee()[:200, :300]
+
+
+@pytest.mark.parametrize("extension", ["jpg", "png"])
+def test_files_that_a_viewer_decodes_are_kept(extension: str, photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / f"photo.{extension}"
+    write_picture(path, photo)
+    loaded = aa.read_picture(path)
+    shown = as_shown(loaded.pixels, "photo", original_bytes(loaded))
+    assert shown.picture.data == path.read_bytes()
+    assert shown.notes == ()
+
+
+def test_a_turned_picture_is_encoded_upright(photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "turned.jpg"
+    exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # orientation 6
+    write_picture(path, photo, Metadata())
+    plain = path.read_bytes()
+    body = b"Exif\0\0" + exif
+    path.write_bytes(plain[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + plain[2:])
+    loaded = aa.read_picture(path)
+    assert loaded.pixels.shape == (300, 200, 3)
+    shown = as_shown(loaded.pixels, "turned", original_bytes(loaded))
+    assert abs(decoded(shown.picture) - loaded.pixels).mean() < 4
+
+
+@pytest.mark.parametrize("extension", ["tif", "webp", "bmp"])
+def test_files_that_no_viewer_decodes_are_encoded(extension: str, photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / f"photo.{extension}"
+    write_picture(path, photo)
+    loaded = aa.read_picture(path)
+    assert abs(decoded(as_shown(loaded.pixels, "photo", original_bytes(loaded)).picture) - photo).mean() < 5
+
+
+def test_other_depths_are_stretched_and_this_is_said(photo: np.ndarray) -> None:
+    for deep in (photo.astype(np.uint16) * 16, photo.astype(np.float32) / 1000):
+        shown = as_shown(deep, "it")
+        assert np.ptp(decoded(shown.picture)) > 230
+        assert str(deep.dtype) in shown.notes[0]
+
+
+def test_alpha_is_left_out(photo: np.ndarray) -> None:
+    clear = np.concatenate([photo, np.full((200, 300, 1), 128, np.uint8)], axis=2)
+    assert decoded(as_shown(clear, "it").picture).shape == photo.shape
+    assert decoded(as_shown(clear[..., [0, 3]], "it").picture).shape == (200, 300)
+
+
+def test_large_pictures_are_shrunken_and_this_is_said() -> None:
+    shown = as_shown(np.zeros((40, MAX_SIDE + 800), np.uint8), "it")
+    assert max(shown.picture.size) <= MAX_SIDE
+    assert f"its full size is {MAX_SIDE + 800} × 40" in shown.notes[0]
+
+
+def test_a_file_that_has_changed_is_not_taken_for_the_picture(photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "photo.jpg"
+    write_picture(path, photo)
+    loaded = aa.read_picture(path)
+    write_picture(path, photo[::-1], overwrite=True)
+    assert original_bytes(loaded) is None
+    path.unlink()
+    assert original_bytes(loaded) is None
+    assert isinstance(loaded, LoadedPicture)
+    assert loaded.sha256 != hashlib.sha256(b"").hexdigest()
+
+
+def test_the_layers_of_a_picture_on_itself(photo: np.ndarray) -> None:
+    drawn = layers(photo, photo, IDENTITY)
+    assert drawn is not None
+    assert drawn.fixed is None  # the picture itself serves
+    assert drawn.size == (300, 200)
+    assert abs(decoded(drawn.moving) - photo).mean() < 4
+    assert decoded(drawn.difference).max() < 10
+    green_magenta = decoded(drawn.green_magenta)
+    assert abs(green_magenta[..., 0] - green_magenta[..., 1]).mean() < 3
+    checkerboard = decoded(drawn.checkerboard)
+    bluer = (checkerboard - photo)[..., 2] - (checkerboard - photo)[..., 0]
+    assert 0.3 < (bluer > 10).mean() < 0.7  # the squares of the moving picture
+
+
+def test_blending_changes_the_overlap_alone(photo: np.ndarray) -> None:
+    drawn = layers(photo, 255 - photo, translation(150, 0))
+    assert drawn is not None
+    moving = decoded(drawn.moving)
+    assert abs(moving[:, :142] - photo[:, :142]).mean() < 4
+    assert abs(moving[:, 158:] - (255.0 - photo[:, 8:150])).mean() < 4
+
+
+def test_fixed_is_green_and_moving_magenta() -> None:
+    bright, dark = np.full((60, 80), 250, np.uint8), np.full((60, 80), 5, np.uint8)
+    bright[::2], dark[::2] = 240, 15
+    drawn = layers(bright, dark, translation(500, 0))  # no overlap: the moving picture is not there
+    assert drawn is not None
+    red, green, blue = decoded(drawn.green_magenta).reshape(-1, 3).mean(0)
+    assert green > 200 > 50 > max(red, blue)
+
+
+def test_large_layers_are_shrunken_together(photo: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "LAYER_PIXELS", 15_000)
+    drawn = layers(photo, photo, IDENTITY)
+    assert drawn is not None
+    assert drawn.size == (150, 100)
+    assert drawn.fixed is not None
+    assert abs(decoded(drawn.fixed) - decoded(drawn.moving)).mean() < 2
+
+
+def test_a_transform_without_an_inverse_draws_nothing(photo: np.ndarray) -> None:
+    assert layers(photo, photo, np.diag([1.0, 0.0, 1.0])) is None
