@@ -28,7 +28,7 @@ _ORB = Rung(
     name="orb at 0.6 MP",
     features=FeatureOptions(detector="orb", working_pixels=0.6e6, max_features=3000),
     matching=MatchOptions(ratio=0.85),
-    enough_px=0.5,
+    enough_px=1.5,
 )
 _SIFT = Rung(
     name="sift at 1 MP",

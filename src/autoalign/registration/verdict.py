@@ -183,10 +183,11 @@ def expected_error(evidence: Evidence) -> float:
     """Mean error over the overlap in fixed px: the fit's, what the model cannot follow, and a floor.
 
     Two independent halves of the evidence differ by twice the error of the whole, which is the fit's error measured
-    without any assumption; the larger of the two counts.
+    without any assumption; the larger of the two counts. What the model cannot follow is seen only where the evidence
+    is, and robust fitting leaves out the worst of it: it counts several times.
     """
     fit = max(evidence.fit_px, 0.5 * evidence.halves_px if np.isfinite(evidence.halves_px) else 0.0)
-    return float(np.sqrt(fit**2 + evidence.model_px**2 + _FLOOR_PX**2))
+    return float(np.sqrt(fit**2 + (_MODEL_FACTOR * evidence.model_px) ** 2 + _FLOOR_PX**2))
 
 
 def hints(evidence: Evidence | None) -> bool:
@@ -195,6 +196,7 @@ def hints(evidence: Evidence | None) -> bool:
 
 
 _FLOOR_PX = 0.002
+_MODEL_FACTOR = 3.0  # true over seen error of scenes that are no plane (scripts/calibrate.py: 1 to 4)
 _HINT = -1.0  # log10 of false alarms; true pairs that a harder attempt saved had -3.4 and less
 
 
