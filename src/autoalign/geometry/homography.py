@@ -112,9 +112,10 @@ def apply(transform: Array, points: ArrayLike) -> Array:
 
 
 def jacobian(transform: Array, points: Array) -> Array:
-    """(n, 2, 2) derivative of the projected position by the position, at each of (n, 2) points."""
+    """(n, 2, 2) derivative of the projected position by the position, at (n, 2) points; inf or nan where w is 0."""
     projected, w = project(transform, points)
-    return (transform[None, :2, :2] - projected[:, :, None] * transform[None, 2:, :2]) / w[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return (transform[None, :2, :2] - projected[:, :, None] * transform[None, 2:, :2]) / w[:, None, None]
 
 
 def transfer_error_squared(dst_from_src: Array, src: Array, dst: Array) -> Array:

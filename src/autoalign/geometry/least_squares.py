@@ -87,6 +87,7 @@ class _Linearised:
         return np.asarray(0.5 * (self.residual**2).sum(0))
 
 
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # points at infinity; polish() looks for them
 def _linearise(model: Model, transform: Array, pairs: Correspondences, norm: Array, src_velocity: Array) -> _Linearised:
     there, _ = project(transform, pairs.src)
     back, _ = project(invert(transform), pairs.dst)

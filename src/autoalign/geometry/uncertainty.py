@@ -15,6 +15,9 @@ from autoalign.geometry.homography import Array, invert, jacobian, normalisation
 from autoalign.geometry.least_squares import Correspondences, tukey_weights, velocities
 
 _MEAN_OF_LENGTH = 0.886  # mean length of a 2-D normal error over its root-mean-square length: sqrt(pi) / 2
+# What Tukey's weights w make of a normal 2-D error, by integration over t = error^2 / (2 sigma^2).
+_VARIANCE_LEFT = 0.821  # mean of w t over the mean of w: the variance of the weighted residuals
+_COVARIANCE_LEFT = 0.898  # mean of w times the variance of the fit, over that of plain least squares
 _MODEL_CELLS = 6  # cells per side of the grid on which residuals are looked at for a pattern
 
 
@@ -43,16 +46,17 @@ def uncertainty(model: Model, dst_from_src: Array, pairs: Correspondences) -> Un
     slope = np.einsum("nij,njg->nig", jacobian(dst_from_src, pairs.src), velocities(model, pairs.src, norm))
     normal = np.einsum("nig,nih->gh", slope * weights[:, None, None], slope)
     freedom = max(2.0 * weights.sum() - model.degrees_of_freedom, 1.0)
-    variance = float((weights * squared).sum() / freedom)
+    variance = float((weights * squared).sum() / freedom) / _VARIANCE_LEFT
     return Uncertainty(
-        covariance=variance * np.linalg.pinv(normal, hermitian=True),
+        covariance=_COVARIANCE_LEFT * variance * np.linalg.pinv(normal, hermitian=True),
         norm=norm,
         residual_px=float(np.sqrt(variance)),
-        model_px=_systematic(pairs.src, residuals, weights),
+        # Weights that fall with the residual would hide the pattern itself.
+        model_px=_systematic(pairs.src[weights > 0], residuals[weights > 0]),
     )
 
 
-def _systematic(points: Array, residuals: Array, weights: Array) -> float:
+def _systematic(points: Array, residuals: Array) -> float:
     """Root-mean-square of the part of the residuals that neighbours share, beyond what noise alone would give.
 
     The mean residual of a cell of a grid has the variance of the noise over its count, if there is only noise.
@@ -61,16 +65,15 @@ def _systematic(points: Array, residuals: Array, weights: Array) -> float:
     cell = np.minimum((points - low) / np.maximum(high - low, 1e-9) * _MODEL_CELLS, _MODEL_CELLS - 1).astype(int)
     index = cell[:, 1] * _MODEL_CELLS + cell[:, 0]
     cells = _MODEL_CELLS**2
-    mass = np.bincount(index, weights, cells)
-    mean = np.stack([np.bincount(index, weights * r, cells) for r in residuals.T], 1) / np.maximum(mass, 1e-9)[:, None]
-    full = mass >= 3.0
+    count = np.bincount(index, minlength=cells)
+    mean = np.stack([np.bincount(index, r, cells) for r in residuals.T], 1) / np.maximum(count, 1)[:, None]
+    full = count >= 3
     if full.sum() < 3:
         return 0.0
-    within = weights * ((residuals - mean[index]) ** 2).sum(1)
-    used = full[index]
-    noise = within[used].sum() / max(mass[full].sum() - full.sum(), 1.0)
-    excess = (mean[full] ** 2).sum(1) - noise / mass[full]
-    return float(np.sqrt(max(float(np.average(excess, weights=mass[full])), 0.0)))
+    within = ((residuals - mean[index]) ** 2).sum(1)
+    noise = within[full[index]].sum() / (count[full].sum() - full.sum())
+    excess = (mean[full] ** 2).sum(1) - noise / count[full]
+    return float(np.sqrt(max(float(np.average(excess, weights=count[full])), 0.0)))
 
 
 def point_errors(model: Model, dst_from_src: Array, known: Uncertainty, points: Array) -> Array:
