@@ -149,8 +149,10 @@ def _prosac_order(n: int, m: int, trials: int) -> tuple[NDArray[np.int64], Mask]
         reached *= (k - i) / (n - i)
     # Each size gets at least one draw (T'_{k+1} = T'_k + ceil(T_{k+1} - T_k) in the paper; a hair less for rounding).
     steps = np.concatenate([[1.0], np.ceil(np.diff(reached) - 1e-9)])
-    growth, draws = np.cumsum(steps), np.arange(1, trials + 1)
-    return k[np.minimum(np.searchsorted(growth, draws), len(k) - 1)], draws <= growth[-1]
+    growth = np.minimum(np.cumsum(steps), trials).astype(np.int64)
+    tops = np.full(trials, n)
+    tops[: growth[-1]] = np.repeat(k, np.diff(growth, prepend=0))
+    return tops, np.arange(trials) < growth[-1]
 
 
 def _draw(rng: np.random.Generator, tops: NDArray[np.int64], growing: Mask, m: int) -> NDArray[np.int64]:
@@ -211,7 +213,6 @@ def _trials_needed(inliers: Mask, tops: NDArray[np.int64], m: int, confidence: f
     The draws were spent on growing sets of the best matches, so each draw counts with the inlier share of its own set.
     The sample that gave the transform agrees with it whatever it is, so it does not count.
     """
-    share = np.maximum(np.cumsum(inliers)[tops - 1] - m, 0) / tops
-    chance = np.clip(share**m, 1e-12, 1 - 1e-12)
-    missed = np.cumsum(np.log1p(-chance))
-    return int(np.searchsorted(-missed, -np.log(1 - confidence))) + 1
+    share = np.maximum(np.cumsum(inliers) - m, 0) / np.arange(1, len(inliers) + 1)
+    unlikely = -np.log1p(-np.clip(share**m, 1e-12, 1 - 1e-12))
+    return int(np.searchsorted(np.cumsum(unlikely[tops - 1]), -np.log(1 - confidence))) + 1
