@@ -192,7 +192,7 @@ def numbers(evidence: dict[str, Any] | None) -> str:
 
 
 def calibration(rows: list[dict[str, Any]]) -> None:
-    """True error over expected error of aligned pairs whose truth is exact, or known from landmarks of their own error."""
+    """True over expected error of aligned pairs whose truth is exact, or known from landmarks, less good."""
     for name, chosen in (("exact", "exact"), ("landmarks", ("cmp", "mm_cv"))):
         group = [
             r for r in rows if r["kind"] == "related" and r["status"] == "aligned" and r["name"].startswith(chosen)
