@@ -7,7 +7,7 @@ places in both pictures (1200 x 800). `shuffled` lists the matches in random ord
 `ordered` sorts them by a made-up quality that is one standard deviation higher for the true ones, as a ratio test does.
 OpenCV draws uniformly and ignores the order. All methods get the same matches, the same threshold (3 sigma; a sigma of
 1 px is what the detectors promise), the same confidence and the same limit of trials, which is twenty times OpenCV's
-default. OpenCV does not seem to count every draw: from 7 % inliers, shuffled, it finds more than so many draws can hold.
+default. OpenCV does not seem to count every draw: of 7 % inliers, shuffled, it finds more than so many draws hold.
 
 `found` is the share of scenes whose mean error over a grid on the picture is under 3 px; `error` is the median of that
 mean error over the scenes found, in px; `time` is the median processor time in ms (one thread), and `ratio` divides it
