@@ -66,7 +66,7 @@ def _climb(pair: Pair, options: AlignOptions) -> Iterator[Attempt]:
         hinted = hinted or hints(attempt.evidence)
         error = attempt.verdict.expected_error_px
         clear = attempt.verdict.status == "aligned" and error is not None and error <= rung.enough_px
-        if clear or perf_counter() - start > options.time_limit:
+        if clear or (options.time_limit is not None and perf_counter() - start > options.time_limit):
             return
 
 

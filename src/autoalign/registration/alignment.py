@@ -38,7 +38,7 @@ class AlignOptions:
     """how hard to look before a pair is given up; max also looks from all sides, which takes seconds"""
     mirror: bool = False
     """also try the moving picture mirrored, as a slide put in the wrong way round"""
-    time_limit: float = float("inf")
+    time_limit: float | None = None
     """seconds after which no harder attempt is begun; the result then depends on the machine"""
     ransac: RansacOptions = field(default_factory=RansacOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)

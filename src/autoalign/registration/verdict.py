@@ -196,7 +196,7 @@ def hints(evidence: Evidence | None) -> bool:
 
 
 _FLOOR_PX = 0.002
-_MODEL_FACTOR = 3.0  # true over seen error of scenes that are no plane (scripts/calibrate.py: 1 to 4)
+_MODEL_FACTOR = 2.0  # true over seen error of scenes that are no plane (scripts/calibrate.py)
 _HINT = -1.0  # log10 of false alarms; true pairs that a harder attempt saved had -3.4 and less
 
 
