@@ -56,7 +56,7 @@ def offsets(image: np.ndarray, quarters: int, how: FeatureOptions) -> np.ndarray
     ],
 )
 def test_orb_points_turn_with_the_picture(size, working_pixels, quarters):
-    """FAST takes whole pixels of a level, so that the points are the same to the rounding of cv2's float32 (2e-4 px)."""
+    """FAST takes whole pixels of a level, so that the points are the same to cv2's float32 (2e-4 px)."""
     off = offsets(view(size), quarters, options("orb", working_pixels=working_pixels))
     assert len(off) > 1000
     lengths = np.linalg.norm(off, axis=1)
@@ -143,7 +143,7 @@ def test_root_sift_is_the_square_root_of_the_histograms():
     raw = raw / np.linalg.norm(raw, axis=1, keepdims=True)
     for ours, theirs in ((root, oracle), (plain, raw)):
         ours = ours / np.linalg.norm(ours, axis=1, keepdims=True)
-        # Rounding each of 128 numbers of a vector of length 4000 by up to a half turns it by 1e-3 at most (in all 0.0014).
+        # Rounding each of 128 numbers of a vector of length 4000 by up to a half turns it by 0.0014 at most.
         assert cKDTree(theirs).query(ours)[0].max() < 2e-3
 
 

@@ -212,7 +212,7 @@ def _from_pyramid(points: Array, octaves: NDArray[np.int64], size: tuple[int, in
 
 
 def _level_size(size: tuple[int, int], octave: int) -> tuple[int, int]:
-    """(w, h) of a level of ORB's pyramid, rounded from single precision as cv2 does it: that decides ties (630 / 1.44)."""
+    """(w, h) of a level of ORB's pyramid, rounded from single precision as cv2 does it, which decides ties."""
     inverse = np.float32(1) / np.float32(float(np.float32(_ORB_STEP)) ** octave)
     w, h = np.rint(np.array(size, np.float32) * inverse).astype(int)
     return int(w), int(h)
