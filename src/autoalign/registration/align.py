@@ -57,13 +57,13 @@ def align(
 
 def _climb(pair: Pair, options: AlignOptions) -> Iterator[Attempt]:
     """Attempts, each harder than the one before, until a verdict is clear or the time is up."""
-    start, hinted = perf_counter(), False
+    start, least = perf_counter(), np.inf
     for rung in rungs(options.effort, options.detector):
-        if rung.on_a_hint and not hinted:
+        if rung.on_a_hint and not hints(least):
             continue
         attempt = _attempt(pair, rung, options)
         yield attempt
-        hinted = hinted or hints(attempt.evidence)
+        least = min(least, attempt.evidence.log10_false_alarms if attempt.evidence else np.inf)
         error = attempt.verdict.expected_error_px
         clear = attempt.verdict.status == "aligned" and error is not None and error <= rung.enough_px
         if clear or (options.time_limit is not None and perf_counter() - start > options.time_limit):

@@ -190,14 +190,19 @@ def expected_error(evidence: Evidence) -> float:
     return float(np.sqrt(fit**2 + (_MODEL_FACTOR * evidence.model_px) ** 2 + _FLOOR_PX**2))
 
 
-def hints(evidence: Evidence | None) -> bool:
-    """Whether the consensus, if not enough for a verdict, is more than unrelated pictures give."""
-    return evidence is not None and evidence.log10_false_alarms < _HINT
+def hints(log10_false_alarms: float) -> bool:
+    """Whether a consensus is more than unrelated pictures give, and not yet all that there is to find.
+
+    Where no chance explains it and still no verdict is clear, the pictures share a caption, or are no plane: a harder
+    look would find the same again.
+    """
+    return _ALL_THERE_IS < log10_false_alarms < _HINT
 
 
 _FLOOR_PX = 0.002
 _MODEL_FACTOR = 2.0  # true over seen error of scenes that are no plane (scripts/calibrate.py)
-_HINT = -1.0  # log10 of false alarms; true pairs that a harder attempt saved had -3.4 and less
+_HINT = -1.0  # true pairs that a harder attempt saved had -3.4 and less
+_ALL_THERE_IS = -60.0  # and those had -41 and more
 
 
 def nothing_found(matches: int) -> Verdict:
