@@ -116,12 +116,16 @@ def test_blending_changes_the_overlap_alone(photo: np.ndarray) -> None:
 
 
 def test_fixed_is_green_and_moving_magenta() -> None:
-    bright, dark = np.full((60, 80), 250, np.uint8), np.full((60, 80), 5, np.uint8)
-    bright[::2], dark[::2] = 240, 15
-    drawn = layers(bright, dark, translation(500, 0))  # no overlap: the moving picture is not there
+    fixed, moving = np.full((60, 80), 20, np.uint8), np.full((60, 80), 20, np.uint8)
+    fixed[20:40, 10:30], moving[20:40, 50:70] = 250, 250
+    drawn = layers(fixed, moving, translation(0, 10))
     assert drawn is not None
-    red, green, blue = decoded(drawn.green_magenta).reshape(-1, 3).mean(0)
-    assert green > 200 > 50 > max(red, blue)
+    pixels = decoded(drawn.green_magenta)
+    red, green, blue = pixels[25:35, 15:25].mean((0, 1))
+    assert green > 200 > 100 > max(red, blue)
+    red, green, blue = pixels[35:45, 55:65].mean((0, 1))
+    assert min(red, blue) > 200 > 100 > green
+    assert pixels[:8].max() < 30  # nothing to compare with
 
 
 def test_large_layers_are_shrunken_together(photo: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

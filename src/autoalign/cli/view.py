@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -62,12 +64,15 @@ def recording_beside(sidecar: Path) -> Path:
 
 
 def check_viewing(viewing: Viewing, sidecar: Path) -> Path | None:
-    """The file to be recorded, or None; without a display `--rerun` records one, since nothing can be shown.
+    """Get ready to show, and say which file is to be recorded, or None. Without a display `--rerun` records one, since
+    nothing can be shown.
 
     Raises as `check_listening` does for a URL where no viewer is.
     """
     if viewing.rerun_connect:
         check_listening(viewing.rerun_connect)
+    if viewing:  # importing rerun takes a second, which is spent while the pair is aligned
+        Thread(target=import_module, args=("autoalign.views.viewer",), daemon=True).start()
     blind = viewing.rerun and not has_display()
     return viewing.save_rrd or (recording_beside(sidecar) if blind else None)
 
@@ -83,7 +88,7 @@ def show(
 ) -> None:
     """Record the alignment of (fixed, moving) once, then save, send and open it as `viewing` asks; `recording` is what
     `check_viewing` made of it."""
-    from autoalign.views.viewer import recorded  # a second that only those who look must wait for
+    from autoalign.views.viewer import recorded  # not above: it would load rerun for those who do not look, too
 
     data = recorded(*pictures, alignment, stream_to=viewing.rerun_connect, timings=timings)
     if recording:

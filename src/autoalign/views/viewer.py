@@ -240,7 +240,8 @@ def _log_matches(recording: rr.RecordingStream, scene: _Scene) -> None:
 
 def _told(name: str, values: Array) -> list[rr.AnyValues]:
     """Numbers (n,) that the viewer tells of the mark under the mouse; rerun refuses none at all."""
-    return [rr.AnyValues(**{name: values.astype(np.float32)})] if len(values) else []
+    told: dict[str, Any] = {name: values.astype(np.float32)}
+    return [rr.AnyValues(**told)] if len(values) else []
 
 
 def _lines(
@@ -451,7 +452,8 @@ def _rung_views(scene: _Scene) -> list[rrb.Grid]:
         )
         for step, attempt in _climbed(scene.alignment)
     ]
-    return [rrb.Grid(*views, grid_columns=2, name=f"What was tried ({len(views)})")] if views else []
+    columns = 2 if len(views) <= 4 else 3
+    return [rrb.Grid(*views, grid_columns=columns, name=f"What was tried ({len(views)})")] if views else []
 
 
 def _overlay_views(scene: _Scene) -> list[rrb.Tabs]:

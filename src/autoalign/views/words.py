@@ -71,8 +71,8 @@ _QUESTIONS = (
     _Question(
         name="a camera can see it",
         options=("max_stretch", "max_anisotropy"),
-        found=lambda evidence: f"scaled {number(evidence.stretch[0])} to {number(evidence.stretch[1])}",
-        needed=lambda options: f"1/{options.max_stretch:g} to {options.max_stretch:g}",
+        found=lambda evidence: f"× {number(evidence.stretch[0])} to {number(evidence.stretch[1])}",
+        needed=lambda options: f"× 1/{options.max_stretch:g} to {options.max_stretch:g}",
     ),
     _Question(
         name="pictures overlap",
@@ -84,7 +84,7 @@ _QUESTIONS = (
         name="pixels agree",
         options=("min_agreement", "sure_agreement"),
         found=lambda evidence: f"{evidence.agreement.share:.0%} of blocks",
-        needed=lambda options: f"≥ {options.sure_agreement:.0%}, never < {options.min_agreement:.0%}",
+        needed=lambda options: f"≥ {options.sure_agreement:.0%}",
     ),
     _Question(
         name="fit is precise",
