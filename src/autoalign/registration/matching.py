@@ -57,7 +57,8 @@ def match(fixed: Features, moving: Features, options: MatchOptions | None = None
     i = i[np.sort(np.unique(j[i], return_index=True)[1])]  # equal descriptors: the first keeps the partner
     j, nearest, rival = j[i], nearest[i], rival[i]
     rival = np.minimum(rival, _nearest(moving.descriptors[j], fixed, options.apart)[2])
-    ratio = np.sqrt(nearest / np.maximum(rival, 1e-12))
+    # Where both are zero, the same descriptor is there twice: no match is less distinctive.
+    ratio = np.sqrt(np.where(rival > 0, nearest / np.maximum(rival, 1e-12), 1.0))
     good = np.flatnonzero(ratio <= options.ratio)
     order = good[np.lexsort((i[good], ratio[good]))]
     order = order[_first_at_its_place(fixed.points[i[order]], moving.points[j[order]])]
