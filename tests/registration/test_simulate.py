@@ -37,7 +37,7 @@ def test_every_view_is_a_turn_and_a_squeeze_by_its_tilt(tilt):
         linear = invert(view.picture_from_view)
         across, along = np.linalg.svd((linear / linear[2, 2])[:2, :2], compute_uv=False)
         assert across == pytest.approx(1.0, abs=1e-9)
-        assert along == pytest.approx(1 / tilt, abs=0.5 / (tilt * (view.pixels.shape[1] - 0.5)))
+        assert along == pytest.approx(1 / tilt, abs=0.5 / (tilt * (view.pixels.shape[1] - 1)))
         assert np.linalg.det(view.picture_from_view) > 0
 
 
