@@ -71,6 +71,17 @@ def test_without_a_display_rerun_names_the_recording(run, pictures, blind) -> No
     assert sound(Path("moving_aligned.autoalign.rrd"))
 
 
+def test_a_viewer_that_does_not_start_costs_no_recording(run, pictures, opened, monkeypatch) -> None:
+    def broken(**_) -> None:
+        raise OSError("the viewer did not start")
+
+    monkeypatch.setattr(view_module, "open_window", broken)
+    outcome = run("pair", "fixed.jpg", "moving.jpg", "--rerun")
+    assert outcome.code == Exit.DONE
+    assert outcome.err.rstrip().endswith("moving_aligned.autoalign.rrd")
+    assert sound(Path("moving_aligned.autoalign.rrd"))
+
+
 def test_a_recording_is_not_replaced_unasked(run, pictures) -> None:
     Path("look.rrd").write_text("mine")
     outcome = run("pair", "fixed.jpg", "moving.jpg", "--save-rrd", "look.rrd")

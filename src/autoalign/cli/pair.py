@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from autoalign.cli.files import SCREEN_PIXEL, check_outputs, read_sized
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
-from autoalign.cli.view import Viewing, check_viewing, show
+from autoalign.cli.view import Viewing, check_viewing, recording_beside, show
 from autoalign.files.points import CORRESPONDENCES, read_points
 from autoalign.files.read import LoadedPicture, read_picture
 from autoalign.files.record import record
@@ -86,7 +86,8 @@ def pair(
     still, mover = read_picture(fixed), read_picture(moving)
     output = files.output or default_output(moving, mover.pixels)
     sidecar = None if files.json == STDOUT else files.json or default_sidecar(output)
-    recording = check_viewing(viewing, sidecar or default_sidecar(output))
+    beside = recording_beside(sidecar or default_sidecar(output))
+    recording = check_viewing(viewing, beside)
     check_outputs(
         [(output, mover.pixels), (files.overlay, SCREEN_PIXEL), (sidecar, None), (recording, None)],
         inputs=[fixed, moving, files.points, files.fixed_mask, files.moving_mask],
@@ -112,7 +113,7 @@ def pair(
     if written:
         note(f"wrote {', '.join(map(str, written))}", common)
     if viewing:
-        show(alignment, (still, mover), viewing, recording, timings=files.timings, common=common)
+        show(alignment, (still, mover), viewing, recording, beside, timings=files.timings, common=common)
     return Exit.DONE if alignment.status == "aligned" else Exit.NOT_ALIGNED
 
 

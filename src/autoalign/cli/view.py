@@ -63,9 +63,9 @@ def recording_beside(sidecar: Path) -> Path:
     return sidecar.with_suffix(".rrd")
 
 
-def check_viewing(viewing: Viewing, sidecar: Path) -> Path | None:
-    """Get ready to show, and say which file is to be recorded, or None. Without a display `--rerun` records one, since
-    nothing can be shown.
+def check_viewing(viewing: Viewing, beside: Path) -> Path | None:
+    """Get ready to show, and say which file is to be recorded, or None. Without a display `--rerun` records one,
+    `beside` the sidecar, since nothing can be shown.
 
     Raises as `check_listening` does for a URL where no viewer is.
     """
@@ -74,7 +74,7 @@ def check_viewing(viewing: Viewing, sidecar: Path) -> Path | None:
     if viewing:  # importing rerun takes a second, which is spent while the pair is aligned
         Thread(target=import_module, args=("autoalign.views.viewer",), daemon=True).start()
     blind = viewing.rerun and not has_display()
-    return viewing.save_rrd or (recording_beside(sidecar) if blind else None)
+    return viewing.save_rrd or (beside if blind else None)
 
 
 def show(
@@ -82,22 +82,33 @@ def show(
     pictures: tuple[LoadedPicture, LoadedPicture],
     viewing: Viewing,
     recording: Path | None,
+    beside: Path,
     *,
     timings: bool,
     common: Common,
 ) -> None:
     """Record the alignment of (fixed, moving) once, then save, send and open it as `viewing` asks; `recording` is what
-    `check_viewing` made of it."""
+    `check_viewing` made of it, `beside` where it is kept if the viewer does not start."""
     from autoalign.views.viewer import recorded  # not above: it would load rerun for those who do not look, too
 
     data = recorded(*pictures, alignment, stream_to=viewing.rerun_connect, timings=timings)
     if recording:
-        write_bytes_atomically(recording, data, common.overwrite)
-        note(f"wrote {recording}", common)
+        _keep(recording, data, common)
     if viewing.rerun and has_display():
-        open_window(recording=data)
+        try:
+            open_window(recording=data)
+        except OSError as error:  # a display that is no good is no display
+            if recording is None:
+                recording = beside
+                _keep(recording, data, common)
+            complain(f"{error}; where it does, autoalign view opens: {recording}")
     elif viewing.rerun:
         complain(f"there is no display to open the viewer on; where there is one, autoalign view opens: {recording}")
+
+
+def _keep(path: Path, data: bytes, common: Common) -> None:
+    write_bytes_atomically(path, data, common.overwrite)
+    note(f"wrote {path}", common)
 
 
 def _recording(path: Path) -> Path:
