@@ -13,7 +13,7 @@ Sources: Gruen 1985 (least-squares matching); Lucas and Kanade 1981; Benhimane a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,6 +35,7 @@ from autoalign.geometry.ransac import Consensus
 from autoalign.picture.pixels import Picture, resize_map, shrink, size_of, to_8_bit
 
 _COMMON_BIAS = 0.25  # sigmas that all keypoints may be off together: ORB's corners are whole pixels
+_SCOUTS = 400  # patches that lead the way, at least
 _HELD_OUT = 5  # every fifth patch judges
 _SMOOTHING = 0.6  # px; takes away what bilinear sampling would distort (measured: 0.4 to 0.7 are alike, 1.0 is worse)
 _Float = NDArray[np.float32]
@@ -48,8 +49,8 @@ class RefineOptions:
     """patches compared, at most; 0 leaves the transform of the keypoints as it is"""
     radius: int = 12
     """a patch is 2 x radius + 1 pixels wide"""
-    rounds: int = 3
-    """times that the patches are compared at full size"""
+    rounds: int = 1
+    """times that all patches are compared at full size, after a few of them have led the way"""
     min_correlation: float = 0.6
     """normalised correlation above which a patch takes part"""
     max_shift: float = 2.0
@@ -104,16 +105,19 @@ def refine(
     fixed, moving = _in_grey_levels(fixed), _in_grey_levels(moving)
     corners = _corners(fixed, transform, size_of(moving), options, masks)
     judges = np.arange(len(corners)) % _HELD_OUT == 0
-    seen: _Look | None = None
-    for level in _levels(fixed, moving, transform, consensus, matched):
-        for _ in range(options.rounds if level.shrunk == 1 else 2):
-            seen = _look(level, transform, corners, options)
-            moved = _fit(model, transform, seen, judges, options)
-            if moved is None:
-                return unchanged
-            transform = moved
-    first = _look(level, consensus.dst_from_src, corners, options)
-    last = _look(level, transform, corners, options)
+    levels = _levels(fixed, moving, transform, consensus, matched)
+    # A few hundred patches lead the way; all of them, and the dearer interpolation, are for the last step.
+    scouts = slice(None, None, max(1, len(corners) // _SCOUTS))
+    finest = replace(levels[-1], moving_bends=_bends(levels[-1].moving))
+    rounds = [(level, scouts) for level in levels for _ in range(2)] + [(finest, slice(None))] * options.rounds
+    for level, chosen in rounds:
+        seen = _look(level, transform, corners[chosen], options)
+        moved = _fit(model, transform, seen, judges[chosen], options)
+        if moved is None:
+            return unchanged
+        transform = moved
+    first = _look(finest, consensus.dst_from_src, corners, options)
+    last = _look(finest, transform, corners, options)
     patches = Patches(pairs=last.pairs, before=first.correlation, after=last.correlation, kept=_usable(last, options))
     helped = _helped(first, last, judges & (first.inside | last.inside))
     if not helped or _contradicts(model, consensus, transform, matched):
@@ -137,10 +141,9 @@ class _Level:
 
     fixed: Picture
     moving: _Float  # sampled between its pixels, hence float
-    moving_bends: tuple[_Float, _Float]  # its second differences along x and along y
+    moving_bends: tuple[_Float, _Float] | None = None  # its second differences along x and y; None: bilinear will do
     fixed_from_level: Array
     moving_from_level: Array
-    shrunk: float  # against the finest level
 
 
 def _levels(
@@ -152,20 +155,18 @@ def _levels(
     fixed_shrink, moving_shrink = max(1.0, zoom), max(1.0, 1.0 / zoom)
     doubt_px = float(np.median(matched.dst_sigma[consensus.inliers])) / fixed_shrink
     halvings = int(np.clip(np.round(np.log2(max(doubt_px, 1.0))), 0, 4))
-    return [_level(fixed, moving, fixed_shrink * 2**h, moving_shrink * 2**h, 2**h) for h in range(halvings, -1, -1)]
+    return [_level(fixed, moving, fixed_shrink * 2**h, moving_shrink * 2**h) for h in range(halvings, -1, -1)]
 
 
-def _level(fixed: Picture, moving: Picture, fixed_shrink: float, moving_shrink: float, shrunk: float) -> _Level:
+def _level(fixed: Picture, moving: Picture, fixed_shrink: float, moving_shrink: float) -> _Level:
     small_fixed, fixed_from_level = _shrunk(fixed, fixed_shrink)
     small_moving, moving_from_level = _shrunk(moving, moving_shrink)
     small_moving = small_moving.astype(np.float32)
     return _Level(
         fixed=small_fixed,
         moving=small_moving,
-        moving_bends=_bends(small_moving),
         fixed_from_level=fixed_from_level,
         moving_from_level=moving_from_level,
-        shrunk=shrunk,
     )
 
 
@@ -264,7 +265,7 @@ def _fixed_patches(image: Picture, centres: Array, reach: int) -> _Float:
 
 
 def _moving_patches(level: _Level, moving_from_fixed: Array, centres: Array, reach: int) -> _Float:
-    """(n, s, s) patches of the moving picture on the pixel grid of the fixed one, by cubic interpolation.
+    """(n, s, s) patches of the moving picture on the pixel grid of the fixed one; cubic if the level has bends.
 
     Everett's formula along x and along y: linear - t (1 - t) / 2 x (the second difference at (1 + t) / 3). Bilinear
     interpolation alone moves fine structure by up to 0.03 px, all of it the same way where t is the same all over.
@@ -275,11 +276,14 @@ def _moving_patches(level: _Level, moving_from_fixed: Array, centres: Array, rea
     t = moving_from_fixed
     w = t[2, 0] * x + t[2, 1] * y + t[2, 2]
     x, y = (t[0, 0] * x + t[0, 1] * y + t[0, 2]) / w, (t[1, 0] * x + t[1, 1] * y + t[1, 2]) / w
+    linear = _bilinear(level.moving, x, y)
+    if level.moving_bends is None:
+        return linear
     whole_x, whole_y = np.floor(x), np.floor(y)
     t_x, t_y = x - whole_x, y - whole_y
     bend_x = _bilinear(level.moving_bends[0], whole_x + (1.0 + t_x) / 3.0, y) * (0.5 * t_x * (1.0 - t_x))
     bend_y = _bilinear(level.moving_bends[1], x, whole_y + (1.0 + t_y) / 3.0) * (0.5 * t_y * (1.0 - t_y))
-    return np.asarray(_bilinear(level.moving, x, y) - (bend_x + bend_y), np.float32)
+    return np.asarray(linear - (bend_x + bend_y), np.float32)
 
 
 def _bilinear(image: _Float, x: Array, y: Array) -> _Float:
