@@ -69,6 +69,18 @@ def test_a_consensus_off_by_a_part_of_a_pixel_comes_back_to_the_truth(name, spre
     assert mean_error_px(result.fixed_from_moving, of) < GOOD_PX
 
 
+@pytest.mark.parametrize("patches", [60, 500, 2500])
+def test_any_number_of_patches_will_do(patches):
+    """With very few, the truth is a little less sharp: noise falls with the square root of their number."""
+    of = pair("gravel.png", translation(6.3, 4.8), (496, 470))
+    matched = keypoints(of, 1.0)
+    result = refine(of.fixed, of.moving, consensus(of, matched, "affine"), matched, RefineOptions(patches=patches))
+    assert result.sharpened
+    assert result.patches is not None
+    assert len(result.patches.kept) > min(0.8 * patches, 2000)
+    assert mean_error_px(result.fixed_from_moving, of) < GOOD_PX
+
+
 @pytest.mark.parametrize("offset", [(0.2, 0.0), (-0.15, 0.12)])
 def test_what_all_keypoints_are_off_together_is_undone(offset):
     """ORB's corners are whole pixels: a shift by 5.25 is 5 to all of them. The pixels know better."""

@@ -42,7 +42,7 @@ def prepare(fixed: Picture, moving: Picture, fixed_valid: Mask | None, moving_va
     check_picture(fixed, "fixed")
     check_picture(moving, "moving")
     masks = _usable(fixed, fixed_valid, "fixed_valid"), _usable(moving, moving_valid, "moving_valid")
-    fixed_grey, moving_grey = grey(fixed), grey(moving)
+    fixed_grey, moving_grey = _finite(grey(fixed)), _finite(grey(moving))
     return Pair(
         fixed=fixed_grey,
         moving=moving_grey,
@@ -53,12 +53,15 @@ def prepare(fixed: Picture, moving: Picture, fixed_valid: Mask | None, moving_va
 
 
 def _usable(image: Picture, valid: Mask | None, name: str) -> Mask | None:
-    """The mask, less what the picture's own alpha hides; None where every pixel may be used."""
+    """The mask, less what the picture's own alpha hides and what is no number; None where every pixel may be used."""
     if valid is not None and valid.shape != image.shape[:2]:
         raise ValueError(f"{name} has shape {valid.shape}, its picture {image.shape[:2]}")
-    shown_part = opaque(image)
-    if valid is None or shown_part is None:
-        usable = shown_part if valid is None else valid.astype(bool)
-    else:
-        usable = valid.astype(bool) & shown_part
+    parts = [np.isfinite(grey(image))] if image.dtype == np.float32 else []
+    parts += [part.astype(bool) for part in (valid, opaque(image)) if part is not None]
+    usable = np.logical_and.reduce(parts) if parts else None
     return None if usable is None or usable.all() else usable
+
+
+def _finite(image: Picture) -> Picture:
+    """The picture with zero for every pixel that is no number; such pixels are masked."""
+    return np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0) if image.dtype == np.float32 else image

@@ -107,9 +107,10 @@ def refine(
     judges = np.arange(len(corners)) % _HELD_OUT == 0
     levels = _levels(fixed, moving, transform, consensus, matched)
     # A few hundred patches lead the way; all of them, and the dearer interpolation, are for the last step.
-    scouts = slice(None, None, max(1, len(corners) // _SCOUTS))
+    scouts = np.flatnonzero(~judges)[:: max(1, len(corners) // _SCOUTS)]
     finest = replace(levels[-1], moving_bends=_bends(levels[-1].moving))
-    rounds = [(level, scouts) for level in levels for _ in range(2)] + [(finest, slice(None))] * options.rounds
+    everyone = np.arange(len(corners))
+    rounds = [(level, scouts) for level in levels for _ in range(2)] + [(finest, everyone)] * options.rounds
     for level, chosen in rounds:
         seen = _look(level, transform, corners[chosen], options)
         moved = _fit(model, transform, seen, judges[chosen], options)
