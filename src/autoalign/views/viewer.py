@@ -56,7 +56,7 @@ _GAP = 0.03  # between them, of a side
 _MARGIN = 0.04  # around the picture in a view, of a side
 _DIMMED = 0.5  # opacity of a picture under marks
 _NIGHT = (13, 16, 17)  # behind dimmed pictures: a light theme would wash them out
-_GREY, _CYAN, _DARK_RED, _MID_RED = (190, 196, 200), (70, 190, 235), (120, 42, 38), (200, 60, 52)
+_CYAN, _DARK_RED, _MID_RED = (70, 190, 235), (120, 42, 38), (200, 60, 52)
 _FADE_STEPS, _BLINK_STEPS, _PER_SECOND = 61, 15, 20.0
 _FIXED_ORDER, _ABOVE_ORDER = -20.0, -10.0  # draw orders; rerun's own for images is -10 and for marks above
 
