@@ -103,9 +103,11 @@ def refine(
     model = MODELS[consensus.model]
     transform = consensus.dst_from_src
     fixed, moving = _in_grey_levels(fixed), _in_grey_levels(moving)
-    corners = _corners(fixed, transform, size_of(moving), options, masks)
-    judges = np.arange(len(corners)) % _HELD_OUT == 0
     levels = _levels(fixed, moving, transform, consensus, matched)
+    level_px = levels[-1].fixed_from_level[0, 0], levels[-1].moving_from_level[0, 0]
+    clear = [_clear(mask, (options.radius + 2) * px) for mask, px in zip(masks, level_px, strict=True)]
+    corners = _corners(fixed, transform, size_of(moving), options, (clear[0], clear[1]))
+    judges = np.arange(len(corners)) % _HELD_OUT == 0
     # A few hundred patches lead the way; all of them, and the dearer interpolation, are for the last step.
     scouts = np.flatnonzero(~judges)[:: max(1, len(corners) // _SCOUTS)]
     finest = replace(levels[-1], moving_bends=_bends(levels[-1].moving))
@@ -184,6 +186,14 @@ def _bends(image: _Float) -> tuple[_Float, _Float]:
     second = np.array([[1.0, -2.0, 1.0]], np.float32)
     along_x, along_y = (cv2.filter2D(image, -1, kernel) for kernel in (second, np.ascontiguousarray(second.T)))
     return np.asarray(along_x), np.asarray(along_y)
+
+
+def _clear(mask: Mask | None, reach_px: float) -> Mask | None:
+    """True where no pixel of a patch that reaches so far is masked."""
+    if mask is None:
+        return None
+    side = 2 * int(np.ceil(reach_px)) + 1
+    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def _corners(
