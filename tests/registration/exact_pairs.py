@@ -1,7 +1,7 @@
 """Pairs of pictures whose transform is known exactly: two views rendered from one continuous scene.
 
 A scene is a cubic spline through a picture of scikit-image's wheel. A view integrates it over each of its pixels
-(4 x 4 samples, symmetric about the pixel's centre), so that neither view is the other's source and the truth is
+(3 x 3 samples, symmetric about the pixel's centre), so that neither view is the other's source and the truth is
 `inverse(scene_from_fixed) @ scene_from_moving`, without any half pixel. Noise is drawn for each view.
 """
 
@@ -22,7 +22,7 @@ from skimage.io import imread
 from autoalign.geometry.homography import Array, apply, invert, project, scaling, shown, translation
 
 Picture = NDArray[Any]
-_SAMPLES = 4  # per pixel and axis
+_SAMPLES = 3  # per pixel and axis
 
 
 @cache

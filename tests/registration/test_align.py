@@ -39,8 +39,13 @@ GOOD_PX = (
 )
 
 
-@cache
 def case(model: str, name: str = "gravel.png") -> tuple[Pair, Alignment]:
+    """A pair and its alignment, made once."""
+    return aligned(model, name)
+
+
+@cache
+def aligned(model: str, name: str) -> tuple[Pair, Alignment]:
     of = pair(name, TRUTHS[model], SIZE)
     return of, align(of.fixed, of.moving)
 

@@ -11,7 +11,7 @@ from exact_pairs import camera, photo, render
 from scipy.spatial import cKDTree
 
 from autoalign.geometry.homography import IDENTITY
-from autoalign.registration.features import DETECTORS, FeatureOptions, Features, detect
+from autoalign.registration.features import DETECTORS, FeatureOptions, Features, detect, with_reversed_contrast
 
 ALL = 100_000  # more keypoints than there are: so that no choice among them hides anything
 
@@ -248,3 +248,32 @@ def test_a_working_size_bounds_the_work_not_the_place():
 def test_options_out_of_range_are_refused(wrong):
     with pytest.raises(ValueError, match="FeatureOptions"):
         FeatureOptions(**wrong)
+
+
+def test_reversed_contrast_is_what_the_negative_shows():
+    """Every keypoint of the negative is among those of the picture with their contrast reversed, at its place and with
+    its descriptor: dark blobs become bright ones, gradients turn round."""
+    image = view((351, 207))
+    how = options("sift")
+    plain, negative = detect(image, how), detect(255 - image, how)
+    either = with_reversed_contrast(plain)
+    assert len(either) == 2 * len(plain)
+    same_place = cKDTree(either.points).query_ball_point(negative.points, 0.05)
+    wanted = negative.descriptors / np.linalg.norm(negative.descriptors, axis=1, keepdims=True)
+    offered = either.descriptors / np.linalg.norm(either.descriptors, axis=1, keepdims=True)
+    # At least 1/8 of the length apart are the descriptors of different things; rounding leaves a hundredth.
+    found = [
+        bool(at) and np.linalg.norm(offered[at] - wanted[i], axis=1).min() < 0.05 for i, at in enumerate(same_place)
+    ]
+    assert np.mean(found) > 0.95
+    before = [
+        np.linalg.norm(offered[: len(plain)][near] - wanted[i], axis=1).min()
+        for i, at in enumerate(same_place)
+        if (near := [k for k in at if k < len(plain)])
+    ]
+    assert np.median(before) > 0.125  # without it, they are not alike
+
+
+def test_only_sift_can_have_its_contrast_reversed():
+    with pytest.raises(ValueError, match="orb"):
+        with_reversed_contrast(detect(view((351, 207)), options("orb")))
