@@ -24,7 +24,7 @@ from autoalign.registration.matching import Matches, match
 from autoalign.registration.mirror import unmirrored
 from autoalign.registration.pair import Pair, prepare
 from autoalign.registration.refine import refine
-from autoalign.registration.verdict import hints, judge, nothing_found, significant, weigh
+from autoalign.registration.verdict import Verdict, hints, judge, nothing_found, significant, weigh
 
 
 def align(
@@ -63,11 +63,19 @@ def _climb(pair: Pair, options: AlignOptions) -> Iterator[Attempt]:
             continue
         attempt = _attempt(pair, rung, options)
         yield attempt
-        least = min(least, attempt.evidence.log10_false_alarms if attempt.evidence else np.inf)
-        error = attempt.verdict.expected_error_px
-        clear = attempt.verdict.status == "aligned" and error is not None and error <= rung.enough_px
-        if clear or (options.time_limit is not None and perf_counter() - start > options.time_limit):
+        log10 = attempt.evidence.log10_false_alarms if attempt.evidence else np.inf
+        least = min(least, log10)
+        if _is_clear(attempt.verdict, log10, rung):
             return
+        if options.time_limit is not None and perf_counter() - start > options.time_limit:
+            return
+
+
+def _is_clear(verdict: Verdict, log10_false_alarms: float, rung: Rung) -> bool:
+    """Whether no harder attempt could tell more: aligned, precise enough, and on more than a thin consensus."""
+    error = verdict.expected_error_px
+    precise = error is not None and error <= rung.enough_px
+    return verdict.status == "aligned" and precise and log10_false_alarms <= rung.enough_log10
 
 
 def _attempt(pair: Pair, rung: Rung, options: AlignOptions) -> Attempt:

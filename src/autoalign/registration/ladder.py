@@ -19,7 +19,8 @@ class Rung:
     name: str
     features: FeatureOptions
     matching: MatchOptions
-    enough_px: float = float("inf")  # an aligned pair with a greater expected error climbs on
+    enough_px: float = float("inf")  # an aligned pair with a greater expected error climbs on,
+    enough_log10: float = float("inf")  # and one whose consensus is thinner, in log10 of false alarms
     on_a_hint: bool = False  # climbed only after a consensus that is not quite chance
     either_contrast: bool = False  # a keypoint may match its own negative
 
@@ -29,11 +30,13 @@ _ORB = Rung(
     features=FeatureOptions(detector="orb", working_pixels=0.6e6, max_features=3000),
     matching=MatchOptions(ratio=0.85),
     enough_px=1.5,
+    enough_log10=-150.0,
 )
 _SIFT = Rung(
     name="sift at 1 MP",
     features=FeatureOptions(detector="sift", working_pixels=1e6, max_features=4000),
     matching=MatchOptions(ratio=0.9),
+    enough_log10=-150.0,
 )
 _MORE_SIFT = Rung(
     name="sift at 2 MP, faint keypoints too",

@@ -202,7 +202,7 @@ def hints(log10_false_alarms: float) -> bool:
 _FLOOR_PX = 0.002
 _MODEL_FACTOR = 2.0  # true over seen error of scenes that are no plane (scripts/calibrate.py)
 _HINT = -1.0  # true pairs that a harder attempt saved had -3.4 and less
-_ALL_THERE_IS = -60.0  # and those had -41 and more
+_ALL_THERE_IS = -150.0  # and those had -86 and more
 
 
 def nothing_found(matches: int) -> Verdict:
