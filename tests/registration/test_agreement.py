@@ -81,12 +81,13 @@ def test_a_shared_caption_agrees_under_the_caption_only():
     assert found.share < 0.25
 
 
-def test_a_shared_frame_is_no_agreement():
-    """Of a fortieth of the picture's width, and as rich as a frame can be."""
+@pytest.mark.parametrize("width", [8, 16, 32, 44])
+def test_a_shared_frame_is_no_agreement(width):
+    """From a fortieth of the picture's width to a seventh, and as rich as a frame can be."""
     fixed, moving = plane().fixed.copy(), other().copy()
     stripes = (128 + 90 * np.sign(np.sin(np.add.outer(np.arange(240), np.arange(320)) * 0.9))).astype(np.uint8)
     inside = np.zeros((240, 320), bool)
-    inside[8:-8, 8:-8] = True
+    inside[width:-width, width:-width] = True
     for image in (fixed, moving):
         image[~inside] = stripes[~inside]
     assert look(fixed, moving).share < 0.25

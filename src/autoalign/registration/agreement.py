@@ -33,7 +33,7 @@ class Agreement:
 
     blocks: int  # with structure in either picture
     agreeing: int  # of them, that correlate better than 19 in 20 by chance
-    share: float  # of the blocks that agree, in the middle one of the parts of the overlap: a caption fills few parts
+    share: float  # of the blocks that agree, in the middle one of the parts of the overlap, see `_middle_share`
     correlation: float  # mean over the blocks, -1 to 1; of gradients where those agree better
 
 
@@ -132,11 +132,17 @@ def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
 
 
 def _middle_share(agreeing: Mask, places: NDArray[np.int64]) -> float:
-    """Median over the parts of the overlap of the share of blocks that agree; `places` (n, 2) are rows and columns."""
+    """The share of blocks that agree in the middle one of the parts of the overlap; `places` (n, 2) are rows, columns.
+
+    The middle one of all parts, and the middle one of those that do not touch the rim: the lesser counts, for a caption
+    fills few parts, and a frame all those at the rim.
+    """
     low, high = places.min(0), places.max(0) + 1
     part = (places - low) * _PARTS // (high - low)
     index = part[:, 0] * _PARTS + part[:, 1]
-    counts = np.bincount(index, minlength=_PARTS**2)
-    shares = np.bincount(index, agreeing, minlength=_PARTS**2) / np.maximum(counts, 1)
+    counts = np.bincount(index, minlength=_PARTS**2).reshape(_PARTS, _PARTS)
+    shares = np.bincount(index, agreeing, minlength=_PARTS**2).reshape(_PARTS, _PARTS) / np.maximum(counts, 1)
     telling = counts >= min(4, counts.max())
-    return float(np.median(shares[telling]))
+    inner = telling.copy()
+    inner[(0, -1), :] = inner[:, (0, -1)] = False
+    return min(float(np.median(shares[chosen])) for chosen in (telling, inner) if chosen.any())
