@@ -218,6 +218,8 @@ def leave_one_scene_out(rows: list[dict[str, Any]]) -> None:
     for key, sign, kinds in (("log10_false_alarms", -1, ("unrelated",)), ("share", 1, ("trap", "caption"))):
         good = [(sign * r["evidence"][r["best"]][key], r["scene"]) for r in true]
         bad = [(sign * value, scene) for value, scene in told(kinds, key)]
+        if not good or not bad:
+            continue
         wrong = 0
         for scene in {s for _, s in good + bad}:
             low = max((v for v, s in bad if s != scene), default=-np.inf)
