@@ -90,7 +90,7 @@ def test_a_shared_frame_is_no_agreement(width):
     inside[width:-width, width:-width] = True
     for image in (fixed, moving):
         image[~inside] = stripes[~inside]
-    assert look(fixed, moving).share < 0.25
+    assert look(fixed, moving).core < 0.25
 
 
 def test_opposite_contrast_agrees_by_its_edges():

@@ -27,7 +27,7 @@ from autoalign.registration.verdict import (
 
 OPTIONS = VerdictOptions()
 SIZES = Sizes(fixed=(640, 480), moving=(600, 500))
-GOOD = Agreement(blocks=200, agreeing=180, share=0.9, correlation=0.8)
+GOOD = Agreement(blocks=200, agreeing=180, share=0.9, core=0.9, correlation=0.8)
 EVIDENCE = Evidence(
     matches=500,
     independent_matches=300,
@@ -56,7 +56,7 @@ def test_sound_evidence_is_aligned_and_says_why():
 
 
 def bad_agreement(share: float) -> Agreement:
-    return replace(GOOD, agreeing=round(200 * share), share=share)
+    return replace(GOOD, agreeing=round(200 * share), share=share, core=share)
 
 
 @pytest.mark.parametrize(
@@ -94,6 +94,7 @@ def test_a_rejection_by_pixels_says_how_many_of_them():
             {"log10_false_alarms": OPTIONS.sure_log10_false_alarms + 1, "agreement": bad_agreement(0.5)},
             "few for a verdict",
         ),
+        ({"agreement": replace(GOOD, core=OPTIONS.min_agreement * 0.8)}, "share a frame"),
         ({"fit_px": 7.0}, "leave the transform open to 7.0 px"),
         ({"halves_px": 14.0}, "leave the transform open to 7.0 px"),  # halves differ by twice the error of the whole
         ({"model_px": 7.0}, "leave the transform open to"),

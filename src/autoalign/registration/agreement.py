@@ -33,11 +33,12 @@ class Agreement:
 
     blocks: int  # with structure in either picture
     agreeing: int  # of them, that correlate better than 19 in 20 by chance
-    share: float  # of the blocks that agree, in the middle one of the parts of the overlap, see `_middle_share`
+    share: float  # of the blocks that agree, in the middle one of the parts of the overlap: a caption fills few parts
+    core: float  # the same for the parts that do not touch the rim: a frame fills none of them
     correlation: float  # mean over the blocks, -1 to 1; of gradients where those agree better
 
 
-NO_AGREEMENT = Agreement(blocks=0, agreeing=0, share=0.0, correlation=0.0)
+NO_AGREEMENT = Agreement(blocks=0, agreeing=0, share=0.0, core=0.0, correlation=0.0)
 
 
 def agreement(
@@ -123,20 +124,19 @@ def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
     shifts = np.unique(np.linspace(1, len(a) - 1, _SHIFTS).astype(int))
     by_chance = np.concatenate([(a * np.roll(b, int(s), axis=0)).mean(1) for s in shifts])
     agreeing = correlation > np.quantile(by_chance, 1.0 - _CHANCE)
+    share, core = _shares(agreeing, np.stack(np.divmod(whole[told], fixed.shape[1] // _BLOCK), 1))
     return Agreement(
         blocks=len(a),
         agreeing=int(agreeing.sum()),
-        share=_middle_share(agreeing, np.stack(np.divmod(whole[told], fixed.shape[1] // _BLOCK), 1)),
+        share=share,
+        core=core,
         correlation=float(correlation.mean()),
     )
 
 
-def _middle_share(agreeing: Mask, places: NDArray[np.int64]) -> float:
-    """The share of blocks that agree in the middle one of the parts of the overlap; `places` (n, 2) are rows, columns.
-
-    The middle one of all parts, and the middle one of those that do not touch the rim: the lesser counts, for a caption
-    fills few parts, and a frame all those at the rim.
-    """
+def _shares(agreeing: Mask, places: NDArray[np.int64]) -> tuple[float, float]:
+    """The share of blocks that agree in the middle one of the parts of the overlap, and in the middle one of those parts
+    that do not touch its rim; `places` (n, 2) are rows and columns."""
     low, high = places.min(0), places.max(0) + 1
     part = (places - low) * _PARTS // (high - low)
     index = part[:, 0] * _PARTS + part[:, 1]
@@ -145,4 +145,5 @@ def _middle_share(agreeing: Mask, places: NDArray[np.int64]) -> float:
     telling = counts >= min(4, counts.max())
     inner = telling.copy()
     inner[(0, -1), :] = inner[:, (0, -1)] = False
-    return min(float(np.median(shares[chosen])) for chosen in (telling, inner) if chosen.any())
+    everywhere = float(np.median(shares[telling]))
+    return everywhere, float(np.median(shares[inner])) if inner.any() else everywhere

@@ -280,6 +280,13 @@ def _doubts(
     found = []
     if evidence.log10_false_alarms > options.sure_log10_false_alarms and evidence.agreement.share < 0.6:
         found.append((f"{_agree(evidence)}, few for a verdict, and {_blocks(evidence)}", "look at the overlay"))
+    if evidence.agreement.core < options.min_agreement <= evidence.agreement.share:
+        found.append(
+            (
+                f"{_agree(evidence)}, but hardly a block in the middle of the overlap: they may share a frame only",
+                "look at the overlay; mask a frame that the pictures share (--fixed-mask, --moving-mask)",
+            )
+        )
     if evidence.agreement.share < options.sure_agreement:
         found.append((f"{_agree(evidence)}, but only {_blocks(evidence)}", "look at the overlay"))
     if error > limit:

@@ -83,7 +83,7 @@ _QUESTIONS = (
     _Question(
         name="pixels agree",
         options=("min_agreement", "sure_agreement"),
-        found=lambda evidence: f"{evidence.agreement.share:.0%} of blocks",
+        found=lambda evidence: f"{min(evidence.agreement.share, evidence.agreement.core):.0%} of blocks",
         needed=lambda options: f"≥ {options.sure_agreement:.0%}",
     ),
     _Question(
