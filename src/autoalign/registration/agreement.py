@@ -135,8 +135,8 @@ def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
 
 
 def _shares(agreeing: Mask, places: NDArray[np.int64]) -> tuple[float, float]:
-    """The share of blocks that agree in the middle one of the parts of the overlap, and in the middle one of those parts
-    that do not touch its rim; `places` (n, 2) are rows and columns."""
+    """The share of blocks that agree in the middle one of the parts of the overlap, and in the middle one of those
+    parts that do not touch its rim; `places` (n, 2) are rows and columns."""
     low, high = places.min(0), places.max(0) + 1
     part = (places - low) * _PARTS // (high - low)
     index = part[:, 0] * _PARTS + part[:, 1]
