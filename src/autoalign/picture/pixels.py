@@ -19,7 +19,7 @@ DTYPES = (np.uint8, np.uint16, np.float32)
 class Shrunken:
     """A picture made smaller, and the transform that takes its pixels to those of the full one."""
 
-    pixels: NDArray[np.uint8]
+    pixels: Picture
     full_from_small: NDArray[np.float64]  # (3, 3)
 
 
@@ -81,10 +81,20 @@ def resize_map(full_size: tuple[int, int], small_size: tuple[int, int]) -> NDArr
     return np.array([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
 
 
-def shrink(image: NDArray[np.uint8], max_pixels: float) -> Shrunken:
+def shrink(image: Picture, max_pixels: float) -> Shrunken:
     """Shrink by area to at most `max_pixels`; a smaller picture comes back as it is."""
     w, h = size_of(image)
     scale = min(1.0, (max_pixels / (w * h)) ** 0.5)
-    small_size = (max(1, round(w * scale)), max(1, round(h * scale)))
-    pixels = image if small_size == (w, h) else cv2.resize(image, small_size, interpolation=cv2.INTER_AREA)
-    return Shrunken(pixels=np.asarray(pixels), full_from_small=resize_map((w, h), small_size))
+    return _shrink_to(image, (max(1, round(w * scale)), max(1, round(h * scale))))
+
+
+def shrink_by(image: Picture, factor: float) -> Shrunken:
+    """Shrink by area to sides `factor` times smaller, rounded to whole pixels; by 1 it comes back as it is."""
+    w, h = size_of(image)
+    return _shrink_to(image, (max(1, round(w / factor)), max(1, round(h / factor))))
+
+
+def _shrink_to(image: Picture, size: tuple[int, int]) -> Shrunken:
+    full_size = size_of(image)
+    pixels = image if size == full_size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return Shrunken(pixels=np.asarray(pixels), full_from_small=resize_map(full_size, size))

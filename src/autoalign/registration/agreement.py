@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from autoalign.geometry.homography import Array, Mask, jacobian, project, translation
 from autoalign.geometry.uncertainty import overlap_points
-from autoalign.picture.pixels import resize_map, size_of
+from autoalign.picture.pixels import shrink_by, size_of
 from autoalign.picture.warp import warp
 
 _OVERLAY_PIXELS = 0.1e6  # the overlap is looked at in so many pixels: coarse, so that a pixel or two do not matter
@@ -90,11 +90,10 @@ def _overlay(
     return small_fixed, warped.pixels, valid
 
 
-def _smaller(image: NDArray[np.uint8] | _Float, factor: float) -> tuple[_Float, Array]:
-    w, h = size_of(image)
-    size = (max(1, round(w / factor)), max(1, round(h / factor)))
-    small = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.GaussianBlur(small, (0, 0), 0.7)), resize_map((w, h), size)
+def _smaller(image: NDArray[np.uint8], factor: float) -> tuple[_Float, Array]:
+    """The picture smaller and smoothed, and the (3, 3) map back to its own pixels."""
+    small = shrink_by(image.astype(np.float32), factor)
+    return np.asarray(cv2.GaussianBlur(small.pixels, (0, 0), 0.7)), small.full_from_small
 
 
 def _edges(image: _Float) -> _Float:

@@ -32,7 +32,7 @@ from autoalign.geometry.homography import (
 )
 from autoalign.geometry.least_squares import Correspondences, polish
 from autoalign.geometry.ransac import Consensus
-from autoalign.picture.pixels import Picture, resize_map, shrink, size_of, to_8_bit
+from autoalign.picture.pixels import Picture, shrink, shrink_by, size_of, to_8_bit
 
 _COMMON_BIAS = 0.25  # sigmas that all keypoints may be off together: ORB's corners are whole pixels
 _SCOUTS = 400  # patches that lead the way, at least
@@ -162,23 +162,13 @@ def _levels(
 
 
 def _level(fixed: Picture, moving: Picture, fixed_shrink: float, moving_shrink: float) -> _Level:
-    small_fixed, fixed_from_level = _shrunk(fixed, fixed_shrink)
-    small_moving, moving_from_level = _shrunk(moving, moving_shrink)
-    small_moving = small_moving.astype(np.float32)
+    small_fixed, small_moving = shrink_by(fixed, fixed_shrink), shrink_by(moving, moving_shrink)
     return _Level(
-        fixed=small_fixed,
-        moving=small_moving,
-        fixed_from_level=fixed_from_level,
-        moving_from_level=moving_from_level,
+        fixed=small_fixed.pixels,
+        moving=small_moving.pixels.astype(np.float32),
+        fixed_from_level=small_fixed.full_from_small,
+        moving_from_level=small_moving.full_from_small,
     )
-
-
-def _shrunk(image: Picture, factor: float) -> tuple[Picture, Array]:
-    """The picture, smaller by `factor`, and the (3, 3) map back to its own pixels."""
-    w, h = size_of(image)
-    size = (max(1, round(w / factor)), max(1, round(h / factor)))
-    small = image if size == (w, h) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small), resize_map((w, h), size)
 
 
 def _bends(image: _Float) -> tuple[_Float, _Float]:
