@@ -59,6 +59,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "points",
             "sidecar",
             "record",
+            "row",
         )
     },
     {"views": ("words", "evidence", "pictures", "viewer", "window")},
