@@ -39,7 +39,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "verdict",
             "alignment",
             "typed",
-            "pair",
+            "prepared",
             "mirror",
             "align",
             "onto_fixed",

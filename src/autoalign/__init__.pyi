@@ -27,6 +27,8 @@ from .registration.features import detect as detect
 from .registration.matching import MatchOptions as MatchOptions
 from .registration.matching import match as match
 from .registration.onto_fixed import warp_onto_fixed as warp_onto_fixed
+from .registration.prepared import Prepared as Prepared
+from .registration.prepared import prepare as prepare
 from .registration.refine import RefineOptions as RefineOptions
 from .registration.refine import refine as refine
 from .registration.typed import align_points as align_points

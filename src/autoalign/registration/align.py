@@ -15,21 +15,21 @@ from autoalign.geometry.homography import Mask
 from autoalign.geometry.least_squares import Correspondences
 from autoalign.geometry.ransac import Consensus, ransac
 from autoalign.geometry.selection import simplest_model
-from autoalign.picture.pixels import Picture, size_of
+from autoalign.picture.pixels import Picture
 from autoalign.registration.agreement import agreement
 from autoalign.registration.alignment import Alignment, AlignOptions, Attempt, ModelChoice
-from autoalign.registration.features import Features, detect, with_reversed_contrast
+from autoalign.registration.features import Features, threads, with_reversed_contrast
 from autoalign.registration.ladder import Rung, rungs
 from autoalign.registration.matching import Matches, match
 from autoalign.registration.mirror import unmirrored
-from autoalign.registration.pair import Pair, prepare
+from autoalign.registration.prepared import Pair, Prepared, prepare
 from autoalign.registration.refine import refine
 from autoalign.registration.verdict import Verdict, hints, judge, nothing_found, significant, weigh
 
 
 def align(
-    fixed: Picture,
-    moving: Picture,
+    fixed: Picture | Prepared,
+    moving: Picture | Prepared,
     options: AlignOptions | None = None,
     *,
     fixed_valid: Mask | None = None,
@@ -38,21 +38,30 @@ def align(
     """Find the transform that puts `moving` onto `fixed`, and say whether to trust it.
 
     Pictures are (h, w) or (h, w, 1..4), uint8, uint16 or float32; masks are (h, w), True where a pixel may be used, and
-    pixels of zero alpha are not used either. A pair that cannot be aligned is a result, `status == "rejected"`.
-    Raises ValueError for arrays that are no pictures. The same input gives the same bits.
+    pixels of zero alpha are not used either. A picture that has many partners is worth a `prepare` of its own.
+    A pair that cannot be aligned is a result, `status == "rejected"`. Raises ValueError for arrays that are no
+    pictures, and for a mask beside a prepared one. The same input gives the same bits.
     """
     options = options or AlignOptions()
-    pair = prepare(fixed, moving, fixed_valid, moving_valid)
+    pair = Pair(fixed=_prepared(fixed, fixed_valid, "fixed"), moving=_prepared(moving, moving_valid, "moving"))
     attempts = list(_climb(pair, options))
     if options.mirror and not any(attempt.verdict.status == "aligned" for attempt in attempts):
         attempts += [unmirrored(attempt, pair.sizes.moving) for attempt in _climb(pair.mirrored(), options)]
     return Alignment(
-        fixed_size=size_of(fixed),
-        moving_size=size_of(moving),
+        fixed_size=pair.fixed.size,
+        moving_size=pair.moving.size,
         options=options,
         attempts=tuple(attempts),
         best=max(attempts, key=_rank),
     )
+
+
+def _prepared(picture: Picture | Prepared, valid: Mask | None, name: str) -> Prepared:
+    if not isinstance(picture, Prepared):
+        return prepare(picture, valid, name=name)
+    if valid is not None:
+        raise ValueError(f"{name}_valid is given beside a picture that is prepared already, with or without a mask")
+    return picture
 
 
 def _climb(pair: Pair, options: AlignOptions) -> Iterator[Attempt]:
@@ -106,13 +115,13 @@ def _concluded(attempt: Attempt, consensus: Consensus, pair: Pair, options: Alig
     with _timed(attempt.seconds, "refine"):
         sharp = significant(attempt.pairs, consensus, pair.sizes, options.verdict)
         refinement = refine(
-            pair.fixed, pair.moving, consensus, attempt.pairs, options.refine, pair.masks, skip=not sharp
+            pair.fixed.grey, pair.moving.grey, consensus, attempt.pairs, options.refine, pair.masks, skip=not sharp
         )
         model, transform = consensus.model, refinement.fixed_from_moving
         if options.model == "auto":
             model, transform = simplest_model(model, transform, refinement.pairs)
     with _timed(attempt.seconds, "verdict"):
-        agreed = agreement(pair.fixed_8_bit, pair.moving_8_bit, transform, *pair.masks)
+        agreed = agreement(pair.fixed.grey_8_bit, pair.moving.grey_8_bit, transform, *pair.masks)
         evidence = weigh(model, transform, attempt.pairs, consensus, refinement.pairs, agreed, pair.sizes)
         verdict = judge(evidence, options.verdict, pair.sizes)
     return replace(
@@ -126,12 +135,9 @@ def _concluded(attempt: Attempt, consensus: Consensus, pair: Pair, options: Alig
 
 
 def _detect_both(pair: Pair, rung: Rung) -> tuple[Features, Features]:
-    """The features of both pictures, found side by side."""
-    with ThreadPoolExecutor(2) as pool:
-        fixed, moving = (
-            pool.submit(detect, image, rung.features, mask)
-            for image, mask in zip((pair.fixed_8_bit, pair.moving_8_bit), pair.masks, strict=True)
-        )
+    """The features of both pictures, found side by side where there are threads for it."""
+    with ThreadPoolExecutor(min(2, threads())) as pool:
+        fixed, moving = (pool.submit(picture.features, rung.features) for picture in (pair.fixed, pair.moving))
         found = moving.result()
         return fixed.result(), with_reversed_contrast(found) if rung.either_contrast else found
 

@@ -83,6 +83,11 @@ def detect(image: NDArray[np.uint8], options: FeatureOptions, valid: Mask | None
     return found[0] if len(found) == 1 else _pooled(found)
 
 
+def threads() -> int:
+    """How many threads the work on pictures may take: as many as cv2 was told."""
+    return cv2.getNumThreads()
+
+
 def with_reversed_contrast(features: Features) -> Features:
     """The SIFT features, and each as it would be found in the picture's negative.
 
