@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from skimage import data
@@ -14,9 +15,23 @@ from autoalign.files.jpeg import decoder
 from autoalign.files.metadata import Metadata
 from autoalign.files.read import LoadedPicture
 from autoalign.files.write import write_picture
-from autoalign.geometry.homography import IDENTITY, translation
+from autoalign.geometry.homography import IDENTITY, scaling, translation
 from autoalign.views import pictures
-from autoalign.views.pictures import MAX_SIDE, Encoded, as_shown, layers, original_bytes
+from autoalign.views.pictures import (
+    MAX_SIDE,
+    THUMBNAIL_SIDE,
+    Encoded,
+    as_shown,
+    layers,
+    original_bytes,
+    thumbnails,
+)
+
+
+def small(data: bytes | None) -> np.ndarray:
+    """(h, w, 3) the pixels of a thumbnail."""
+    assert data is not None
+    return decoder().decode(data).astype(float)
 
 
 def decoded(picture: Encoded) -> np.ndarray:
@@ -139,3 +154,69 @@ def test_large_layers_are_shrunken_together(photo: np.ndarray, monkeypatch: pyte
 
 def test_a_transform_without_an_inverse_draws_nothing(photo: np.ndarray) -> None:
     assert layers(photo, photo, np.diag([1.0, 0.0, 1.0])) is None
+
+
+def test_thumbnails_show_the_pictures_shrunken_by_area(photo: np.ndarray) -> None:
+    found = thumbnails(photo, photo, IDENTITY)
+    oracle = cv2.resize(photo, (THUMBNAIL_SIDE, 107), interpolation=cv2.INTER_AREA)
+    for thumbnail in (found.fixed, found.before, found.after):
+        assert small(thumbnail).shape == (107, THUMBNAIL_SIDE, 3)
+        assert abs(small(thumbnail) - oracle)[1:-1, 1:-1].mean() < 4
+
+
+def test_a_thumbnail_is_laid_where_the_transform_lays_the_picture() -> None:
+    fixed, moving = np.zeros((400, 640), np.uint8), np.zeros((200, 320), np.uint8)
+    moving[100:140, 40:80] = 255  # by the transform rows 200 to 280, columns 240 to 320 of fixed
+    found = thumbnails(fixed, moving, translation(160.5, 0.5) @ scaling(2, 2))
+    row, column = np.nonzero(small(found.after)[..., 0] > 128)
+    assert (row.min(), row.max(), column.min(), column.max()) == (50, 69, 60, 79)
+    row, column = np.nonzero(small(found.before)[..., 0] > 128)
+    assert (row.min(), row.max(), column.min(), column.max()) == (50, 69, 20, 39)
+
+
+def test_before_keeps_its_proportions() -> None:
+    found = thumbnails(np.zeros((300, 600), np.uint8), np.full((500, 500), 255, np.uint8), None)
+    lit = small(found.before)[..., 0] > 128
+    columns = np.flatnonzero(lit.any(axis=0))
+    assert lit.shape == (80, 160)
+    assert lit.any(axis=1).sum() >= 78
+    assert len(columns) == pytest.approx(80, abs=2)
+    assert columns.mean() == pytest.approx(79.5, abs=1)
+    assert found.after is None
+
+
+def test_a_fixed_picture_has_one_thumbnail_beside_any_other(photo: np.ndarray) -> None:
+    grey = photo[..., 0]
+    found = [thumbnails(grey, other, IDENTITY) for other in (photo, grey[::-1], grey.astype(np.uint16))]
+    assert len({each.fixed for each in found}) == 1
+    assert found[0] == thumbnails(grey, photo, IDENTITY)
+
+
+def test_thumbnails_of_other_depths_are_stretched(photo: np.ndarray) -> None:
+    dark = (photo // 8).astype(np.uint16)
+    for deep in (dark, dark.astype(np.float32) / 1000, np.dstack([dark, np.full(dark.shape[:2], 9, np.uint16)])):
+        found = thumbnails(deep, deep, IDENTITY)
+        assert min(np.ptp(small(each)) for each in (found.fixed, found.before, found.after)) > 180
+
+
+def test_large_pictures_are_shrunken_before_they_are_warped(monkeypatch: pytest.MonkeyPatch) -> None:
+    warped = []
+    plain_warp = pictures.warp
+    monkeypatch.setattr(
+        pictures, "warp", lambda picture, *others: warped.append(picture.size) or plain_warp(picture, *others)
+    )
+    scene = np.random.default_rng(0).integers(0, 255, (1500, 2000), np.uint8)
+    found = thumbnails(scene, scene, IDENTITY)
+    assert max(warped) <= THUMBNAIL_SIDE * 120
+    assert small(found.after).std() < 12  # fine noise is averaged, not picked from
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 900), (3, 2)])
+def test_thumbnails_of_pictures_of_hardly_any_size(size: tuple[int, int], photo: np.ndarray) -> None:
+    tiny = np.full(size, 200, np.uint8)
+    assert small(thumbnails(tiny, photo, IDENTITY).fixed).mean() == pytest.approx(200, abs=3)
+    assert small(thumbnails(photo, tiny, IDENTITY).before).shape == (107, THUMBNAIL_SIDE, 3)
+
+
+def test_a_transform_without_an_inverse_has_no_thumbnail(photo: np.ndarray) -> None:
+    assert thumbnails(photo, photo, np.diag([1.0, 0.0, 1.0])).after is None

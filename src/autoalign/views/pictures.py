@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from autoalign.files.formats import HEAD_BYTES, JPEG, PNG, Format, decoder_for, encoder_for, of_bytes
 from autoalign.files.metadata import Metadata
 from autoalign.files.read import LoadedPicture
-from autoalign.geometry.homography import Array, jacobian
+from autoalign.files.row import Thumbnails
+from autoalign.geometry.homography import Array, jacobian, scaling, translation
 from autoalign.geometry.uncertainty import overlap_points
 from autoalign.picture.compose import compose
-from autoalign.picture.pixels import Picture, has_alpha, shrink, size_of, to_8_bit
+from autoalign.picture.pixels import Picture, has_alpha, opaque, shrink, size_of, to_8_bit
 from autoalign.picture.warp import warp
 
 MAX_SIDE = 8192  # px; the textures of many a graphics card and of every browser end here
 LAYER_PIXELS = 1.6e6  # of the pictures of both in one frame: more than a screen shows of them; some 300 kB each
 QUALITY = 80  # of JPEGs made here: no artefact that could be taken for a misalignment
+THUMBNAIL_SIDE = 160  # px, of the longer one
+THUMBNAIL_QUALITY = 70  # of JPEGs that stand by the thousand in one file
 _TINT = np.array([70, 150, 255], np.uint16)  # of the moving picture's squares of the checkerboard
 _TINTED = 56  # 256ths
 
@@ -57,6 +60,15 @@ class Layers:
     difference: Encoded
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Both:
+    """Two pictures in one frame."""
+
+    fixed: _Pixels  # (h, w, 3)
+    moving: _Pixels  # (h, w, 3), black where it has no data
+    valid: NDArray[np.bool_]  # (h, w) where the moving one has data
+
+
 def original_bytes(loaded: LoadedPicture) -> bytes | None:
     """The file's bytes, if they still are those that were read."""
     try:
@@ -85,29 +97,66 @@ def as_shown(picture: Picture, name: str, original: bytes | None = None) -> Show
 
 def layers(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> Layers | None:
     """Both pictures in one frame under a transform (3, 3), whatever the verdict on it; None if it has no inverse."""
+    both = _in_one_frame(fixed, moving, fixed_from_moving)
+    if both is None:
+        return None
+    a, b, valid = both.fixed, both.moving, both.valid
+
+    def drawn(style: str, moving_pixels: _Pixels = b) -> _Pixels:
+        return compose(style, a, moving_pixels, None, valid)
+
+    return Layers(
+        size=size_of(a),
+        fixed=None if size_of(a) == size_of(fixed) and fixed.dtype == np.uint8 else _encoded(a),
+        moving=_encoded(np.where(valid[..., None], b, a)),
+        checkerboard=_encoded(drawn("checkerboard", _tinted(b))),
+        green_magenta=_encoded(np.where(valid[..., None], drawn("red-cyan")[..., [1, 0, 1]], a // 3)),
+        difference=_encoded(drawn("difference")),
+    )
+
+
+def thumbnails(fixed: Picture, moving: Picture, fixed_from_moving: Array | None) -> Thumbnails:
+    """Both pictures small, and the moving one as a transform (3, 3) lays it, whatever the verdict on that.
+
+    Before, the moving picture stands whole in the middle of the fixed one's frame, its sides in proportion. Black is
+    where it has no data. The same fixed picture gives the same bytes beside any other. Without a transform, or with one
+    that has no inverse, `after` is None. Pictures are (h, w) or (h, w, 1..4), of any depth that autoalign reads.
+    """
+    w, h = size_of(fixed)
+    small = shrink(fixed, min(1.0, THUMBNAIL_SIDE / max(w, h)) ** 2 * w * h)
+    small_from_fixed = np.linalg.inv(small.full_from_small)
+    before = _in_one_frame(small.pixels, moving, _fitted(size_of(moving), size_of(small.pixels)))
+    assert before is not None  # a fit has an inverse
+    after = None
+    if fixed_from_moving is not None:
+        after = _in_one_frame(small.pixels, moving, small_from_fixed @ fixed_from_moving)
+    return Thumbnails(
+        fixed=_encoded(before.fixed, THUMBNAIL_QUALITY).data,
+        before=_encoded(before.moving, THUMBNAIL_QUALITY).data,
+        after=None if after is None else _encoded(after.moving, THUMBNAIL_QUALITY).data,
+    )
+
+
+def _fitted(moving_size: tuple[int, int], fixed_size: tuple[int, int]) -> Array:
+    """(3, 3) fixed_from_moving that fits the moving picture into the fixed one's frame, middle on middle."""
+    scale = min(fixed_size[0] / moving_size[0], fixed_size[1] / moving_size[1])
+    (x, y), (moving_x, moving_y) = (((w - 1) / 2, (h - 1) / 2) for w, h in (fixed_size, moving_size))
+    return translation(x, y) @ scaling(scale, scale) @ translation(-moving_x, -moving_y)
+
+
+def _in_one_frame(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> _Both | None:
+    """Both in the frame of the fixed one, which is shrunken to `LAYER_PIXELS`; None if the transform has no inverse."""
     if np.linalg.matrix_rank(fixed_from_moving) < 3:
         return None
     still = shrink(fixed, LAYER_PIXELS)
     mover = shrink(moving, moving.shape[0] * moving.shape[1] / _squeeze(fixed, moving, fixed_from_moving) ** 2)
     small_from_fixed = np.linalg.inv(still.full_from_small)
     moved = warp(mover.pixels, size_of(still.pixels), small_from_fixed @ fixed_from_moving @ mover.full_from_small)
-    everywhere = np.ones(moved.valid.shape, bool)
-    # Side by side they have become alike, 8-bit and free of alpha.
-    both = _rgb(compose("side-by-side", still.pixels, moved.pixels, everywhere, moved.valid))
+    # Side by side they become alike: 8-bit and free of alpha.
+    both = _rgb(compose("side-by-side", still.pixels, moved.pixels, None, moved.valid))
     a, b = both[:, : both.shape[1] // 2], both[:, both.shape[1] // 2 :]
-    valid = moved.valid if not has_alpha(moved.pixels) else moved.valid & (moved.pixels[..., -1] > 0)
-
-    def drawn(style: str, moving_pixels: _Pixels = b) -> _Pixels:
-        return compose(style, a, moving_pixels, everywhere, valid)
-
-    return Layers(
-        size=size_of(still.pixels),
-        fixed=None if still.pixels is fixed and fixed.dtype == np.uint8 else _encoded(a),
-        moving=_encoded(np.where(valid[..., None], b, a)),
-        checkerboard=_encoded(drawn("checkerboard", _tinted(b))),
-        green_magenta=_encoded(np.where(valid[..., None], drawn("red-cyan")[..., [1, 0, 1]], a // 3)),
-        difference=_encoded(drawn("difference")),
-    )
+    seen = opaque(moved.pixels)
+    return _Both(fixed=a, moving=b, valid=moved.valid if seen is None else moved.valid & seen)
 
 
 def _kept(picture: Picture, original: bytes) -> Encoded | None:
@@ -121,9 +170,9 @@ def _kept(picture: Picture, original: bytes) -> Encoded | None:
     return Encoded(data=original, media_type=_MEDIA_TYPES[format], size=header.size)
 
 
-def _encoded(pixels: _Pixels) -> Encoded:
+def _encoded(pixels: _Pixels, quality: int = QUALITY) -> Encoded:
     grey = pixels[..., 0] if pixels.shape[2:] == (1,) else pixels
-    data = encoder_for(JPEG, QUALITY)(grey, Metadata())
+    data = encoder_for(JPEG, quality)(grey, Metadata())
     return Encoded(data=data, media_type=_MEDIA_TYPES[JPEG], size=size_of(pixels))
 
 
