@@ -42,7 +42,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "prepared",
             "mirror",
             "align",
-            "onto_fixed",
+            "drawing",
         )
     },
     {
@@ -59,6 +59,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "points",
             "sidecar",
             "record",
+            "result",
             "row",
         )
     },

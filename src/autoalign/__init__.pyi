@@ -22,11 +22,11 @@ from .picture.warp import warp as warp
 from .registration.align import align as align
 from .registration.alignment import Alignment as Alignment
 from .registration.alignment import AlignOptions as AlignOptions
+from .registration.drawing import warp_onto_fixed as warp_onto_fixed
 from .registration.features import FeatureOptions as FeatureOptions
 from .registration.features import detect as detect
 from .registration.matching import MatchOptions as MatchOptions
 from .registration.matching import match as match
-from .registration.onto_fixed import warp_onto_fixed as warp_onto_fixed
 from .registration.prepared import Prepared as Prepared
 from .registration.prepared import prepare as prepare
 from .registration.refine import RefineOptions as RefineOptions

@@ -23,7 +23,7 @@ from autoalign.geometry.homography import IDENTITY, Array, scaling, translation
 from autoalign.picture.warp import warp
 from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment, AlignOptions
-from autoalign.registration.onto_fixed import warp_onto_fixed
+from autoalign.registration.drawing import warp_onto_fixed
 from autoalign.registration.refine import RefineOptions
 
 SIZE = (320, 240)

@@ -16,8 +16,9 @@ from autoalign.files.points import POSITIONS, read_points, write_points
 from autoalign.files.sidecar import Sidecar, read_sidecar, transform_of
 from autoalign.files.write import default_output, write_picture
 from autoalign.geometry.homography import invert, project
-from autoalign.picture.canvas import CanvasKind, canvas
-from autoalign.picture.warp import Interpolation, warp
+from autoalign.picture.canvas import CanvasKind
+from autoalign.picture.warp import Interpolation
+from autoalign.registration.drawing import Drawing, draw
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,12 +85,11 @@ def _output(image: Path, options: ApplyOptions) -> Path:
 
 def _put(record: Sidecar, image: Path, output: Path, options: ApplyOptions, common: Common) -> None:
     """One picture through the transform."""
-    moving_size = record.moving.size
-    loaded = read_sized(image, moving_size)
+    loaded = read_sized(image, record.moving.size)
     transform = transform_of(record)
-    frame = canvas(options.canvas or record.options.get("canvas", "fixed"), record.fixed.size, moving_size, transform)
-    moved = warp(loaded.pixels, frame.size, frame.canvas_from_fixed @ transform, interpolation=options.interpolation)
-    write_picture(output, moved.pixels, loaded.metadata, overwrite=common.overwrite)
+    drawing = Drawing(canvas=options.canvas or record.options.get("canvas", "fixed"))
+    drawn = draw(loaded.pixels, record.fixed.size, transform, drawing, interpolation=options.interpolation)
+    write_picture(output, drawn.warped.pixels, loaded.metadata, overwrite=common.overwrite)
     note(f"wrote {output}", common)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,15 +18,15 @@ from autoalign.cli.view import Viewing, check_viewing, recording_beside, show
 from autoalign.files.points import CORRESPONDENCES, read_points
 from autoalign.files.read import LoadedPicture, read_picture
 from autoalign.files.record import record
+from autoalign.files.result import ResultFiles, write_result
 from autoalign.files.sidecar import default_sidecar, sidecar_text, write_sidecar
-from autoalign.files.write import default_output, write_picture
+from autoalign.files.write import default_output
 from autoalign.geometry.ransac import RansacOptions
-from autoalign.picture.canvas import CanvasKind, canvas
-from autoalign.picture.compose import STYLES, compose
+from autoalign.picture.compose import STYLES
 from autoalign.picture.pixels import grey, size_of
-from autoalign.picture.warp import warp
 from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment, AlignOptions
+from autoalign.registration.drawing import Drawing
 from autoalign.registration.refine import RefineOptions
 from autoalign.registration.typed import align_points
 from autoalign.registration.verdict import VerdictOptions
@@ -45,8 +45,6 @@ class PairFiles:
 
     output: Annotated[Path | None, Parameter(alias="-o")] = None
     """the aligned picture; by default <MOVING>_aligned<ext> beside MOVING"""
-    canvas: CanvasKind = "fixed"
-    """frame of the aligned picture: FIXED's own, one that holds both, or one that holds all of MOVING as it lies"""
     overlay: Path | None = None
     """also write both pictures as one, to look at"""
     overlay_style: Annotated[str, Parameter(choices=tuple(STYLES))] = "mean"
@@ -69,6 +67,7 @@ def pair(
     /,
     *,
     files: Annotated[PairFiles, Parameter(name="*", group=FILES)] = PairFiles(),
+    drawing: Annotated[Drawing, Parameter(name="*", group=FILES)] = Drawing(),
     viewing: Annotated[Viewing, Parameter(name="*", group=Group("Viewer", sort_key=1.5))] = Viewing(),
     options: Annotated[AlignOptions, Parameter(name="*", group=Group("Alignment", sort_key=2))] = AlignOptions(),
     common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
@@ -94,8 +93,15 @@ def pair(
         overwrite=common.overwrite,
     )
     alignment = _align(still, mover, files, options)
-    written = _draw(alignment, still, mover, files, output, common.overwrite)
-    kept = record(alignment, still, mover, drawn={"canvas": files.canvas}, timings=files.timings)
+    written = []
+    if alignment.status != "rejected":
+        pictures = ResultFiles(
+            aligned=output if alignment.status == "aligned" else None,
+            overlay=files.overlay,
+            overlay_style=files.overlay_style,
+        )
+        written = write_result(pictures, still, mover, alignment.fixed_from_moving, drawing, common.overwrite)
+    kept = record(alignment, still, mover, drawn=asdict(drawing), timings=files.timings)
     if sidecar is None:
         sys.stdout.write(sidecar_text(kept))
     else:
@@ -145,32 +151,6 @@ def _align(fixed: LoadedPicture, moving: LoadedPicture, files: PairFiles, option
 def _usable(mask: Path | None, picture: LoadedPicture) -> NDArray[np.bool_] | None:
     """(h, w) True where the mask is black, that is, where nothing of the picture is to be ignored."""
     return None if mask is None else grey(read_sized(mask, size_of(picture.pixels)).pixels) == 0
-
-
-def _draw(
-    alignment: Alignment,
-    fixed: LoadedPicture,
-    moving: LoadedPicture,
-    files: PairFiles,
-    output: Path,
-    overwrite: bool,
-) -> list[Path]:
-    """Write the picture of an aligned pair and the overlay of one that is not rejected; the files written."""
-    written: list[Path] = []
-    if alignment.status == "rejected":
-        return written
-    transform = alignment.fixed_from_moving
-    frame = canvas(files.canvas, size_of(fixed.pixels), size_of(moving.pixels), transform)
-    moved = warp(moving.pixels, frame.size, frame.canvas_from_fixed @ transform)
-    if alignment.status == "aligned":
-        write_picture(output, moved.pixels, moving.metadata, overwrite=overwrite)
-        written.append(output)
-    if files.overlay is not None:
-        still = warp(fixed.pixels, frame.size, frame.canvas_from_fixed)
-        both = compose(files.overlay_style, still.pixels, moved.pixels, still.valid, moved.valid)
-        write_picture(files.overlay, both, overwrite=overwrite)
-        written.append(files.overlay)
-    return written
 
 
 def _tell_stages(alignment: Alignment) -> None:

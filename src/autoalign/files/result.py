@@ -1,0 +1,55 @@
+"""The result of a pair as files: the moving picture drawn over the fixed one, with what travels with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from autoalign.files.read import LoadedPicture
+from autoalign.files.write import write_picture
+from autoalign.geometry.homography import Array
+from autoalign.picture.compose import compose
+from autoalign.picture.pixels import size_of
+from autoalign.picture.warp import warp
+from autoalign.registration.drawing import Drawing, Drawn, draw
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultFiles:
+    """Where the pictures of a result go; None for one that is not wanted."""
+
+    aligned: Path | None = None
+    overlay: Path | None = None
+    overlay_style: str = "mean"
+
+
+def write_result(
+    files: ResultFiles,
+    fixed: LoadedPicture,
+    moving: LoadedPicture,
+    fixed_from_moving: Array,
+    drawing: Drawing,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Draw the pictures that are wanted, write them, and say which they are.
+
+    Raises CanvasError where no canvas can hold them, ImageWriteError as `write_picture` does.
+    """
+    written: list[Path] = []
+    if files.aligned is None and files.overlay is None:
+        return written
+    drawn = draw(moving.pixels, size_of(fixed.pixels), fixed_from_moving, drawing)
+    if files.aligned is not None:
+        write_picture(files.aligned, drawn.warped.pixels, moving.metadata, overwrite=overwrite)
+        written.append(files.aligned)
+    if files.overlay is not None:
+        _write_overlay(files.overlay, files.overlay_style, fixed, drawn, overwrite)
+        written.append(files.overlay)
+    return written
+
+
+def _write_overlay(path: Path, style: str, fixed: LoadedPicture, drawn: Drawn, overwrite: bool) -> None:
+    """Both pictures as one, in the frame that the moving one was drawn in."""
+    still, moved = warp(fixed.pixels, drawn.frame.size, drawn.frame.canvas_from_fixed), drawn.warped
+    both = compose(style, still.pixels, moved.pixels, still.valid, moved.valid)
+    write_picture(path, both, overwrite=overwrite)

@@ -1,0 +1,60 @@
+"""A transform put to use: the moving picture drawn in the frame of the fixed one, or in a frame that holds more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from autoalign.geometry.homography import Array
+from autoalign.picture.canvas import Canvas, CanvasKind, canvas
+from autoalign.picture.pixels import Picture, size_of
+from autoalign.picture.warp import Interpolation, Warped, warp
+from autoalign.registration.alignment import Alignment
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawing:
+    """How the moving picture is drawn."""
+
+    canvas: CanvasKind = "fixed"
+    """frame of the aligned picture: FIXED's own, one that holds both, or one that holds all of MOVING as it lies"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """The moving picture as it was drawn, and the frame it was drawn in."""
+
+    warped: Warped
+    frame: Canvas
+
+
+def draw(
+    moving: Picture,
+    fixed_size: tuple[int, int],
+    fixed_from_moving: Array,
+    drawing: Drawing,
+    *,
+    interpolation: Interpolation = "linear",
+) -> Drawn:
+    """`moving` (h, w) or (h, w, c) through a transform (3, 3) onto a fixed picture of size (w, h).
+
+    Raises CanvasError where no canvas can hold what `drawing` asks for.
+    """
+    frame = canvas(drawing.canvas, fixed_size, size_of(moving), fixed_from_moving)
+    warped = warp(moving, frame.size, frame.canvas_from_fixed @ fixed_from_moving, interpolation=interpolation)
+    return Drawn(warped=warped, frame=frame)
+
+
+def warp_onto_fixed(
+    moving: Picture,
+    alignment: Alignment,
+    *,
+    interpolation: Interpolation = "linear",
+    fill: float | Sequence[float] = 0,
+) -> Picture:
+    """`moving` (h, w) or (h, w, c) resampled to the size of the fixed picture; `fill` where it has no data.
+
+    For the mask of where it has data, call `warp` itself. Raises AlignmentError if the pair was rejected.
+    """
+    fixed_from_moving = alignment.fixed_from_moving
+    return warp(moving, alignment.fixed_size, fixed_from_moving, interpolation=interpolation, fill=fill).pixels
