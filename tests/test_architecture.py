@@ -47,6 +47,9 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
     },
     {
         "files": (
+            "exif",
+            "georeference",
+            "microscope",
             "metadata",
             "codec",
             "jpeg",
@@ -57,6 +60,8 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "read",
             "write",
             "points",
+            "sized",
+            "feature_store",
             "sidecar",
             "record",
             "result",
@@ -64,6 +69,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
         )
     },
     {"views": ("words", "evidence", "pictures", "viewer", "window")},
+    {"batch": ("slot", "engine")},
     {"cli": ("terminal", "settings", "files", "view", "pair", "rectify", "apply", "main")},
 )
 
@@ -78,19 +84,23 @@ HOMES: dict[str, tuple[str, ...]] = {
         "registration.features",
         "registration.refine",
         "registration.agreement",
+        "files.feature_store",  # its version only
         "files.record",  # its version only
+        "batch.slot",  # its threads only
     ),
     "cyclopts": ("cli.terminal", "cli.settings", "cli.pair", "cli.rectify", "cli.apply", "cli.view", "cli.main"),
     "imagecodecs": ("files.png",),
     "lazy_loader": ("",),
+    "psutil": ("batch.slot",),
     "rerun": ("views.viewer",),
     "rich": ("cli.terminal",),
     "simplejpeg": ("files.jpeg",),
     "skimage": ("registration.alignment",),  # its ProjectiveTransform, for those who live there
+    "threadpoolctl": ("batch.slot",),
     "tifffile": ("files.tiff",),
 }
 
-NOT_LOADED_BY_IMPORT = ("rerun", "typer", "cyclopts", "rich", "fastapi", "dask", "cv2", "skimage", "numpy")
+NOT_LOADED_BY_IMPORT = ("rerun", "typer", "cyclopts", "rich", "fastapi", "distributed", "cv2", "skimage", "numpy")
 
 
 def modules() -> dict[str, Path]:

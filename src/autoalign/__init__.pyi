@@ -1,6 +1,7 @@
 from .errors import AlignmentError as AlignmentError
 from .errors import AutoalignError as AutoalignError
 from .errors import CanvasError as CanvasError
+from .errors import EngineError as EngineError
 from .errors import ImageReadError as ImageReadError
 from .errors import ImageWriteError as ImageWriteError
 from .files.points import read_points as read_points

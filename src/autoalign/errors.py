@@ -3,6 +3,7 @@
 AutoalignError                  catch this one to catch them all
 ├── AlignmentError              the transform of a pair that was rejected was asked for
 ├── CanvasError                 a canvas that would be endless (the horizon crosses it) or larger than allowed
+├── EngineError                 there is nowhere to run a batch: no worker starts, the scheduler is gone
 ├── ImageReadError              a file is missing, damaged, too large or no picture; the path comes last
 └── ImageWriteError             a file could not be written; nothing half-written is left; the path comes last
 
@@ -20,6 +21,10 @@ class AlignmentError(AutoalignError):
 
 class CanvasError(AutoalignError):
     """The requested canvas is endless or too large."""
+
+
+class EngineError(AutoalignError):
+    """No worker can be started or reached."""
 
 
 class ImageReadError(AutoalignError):
