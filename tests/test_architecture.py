@@ -27,7 +27,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "uncertainty",
         )
     },
-    {"picture": ("pixels", "warp", "canvas", "compose")},
+    {"picture": ("pixels", "warp", "border", "canvas", "compose")},
     {
         "registration": (
             "simulate",
@@ -69,7 +69,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
         )
     },
     {"views": ("words", "evidence", "pictures", "viewer", "window")},
-    {"batch": ("slot", "engine")},
+    {"batch": ("jobs", "sources", "manifest", "memory", "work", "slot", "engine")},
     {"cli": ("terminal", "settings", "files", "view", "pair", "rectify", "apply", "main")},
 )
 
@@ -79,6 +79,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "cv2": (
         "picture.pixels",
         "picture.warp",
+        "picture.border",
         "picture.compose",
         "registration.simulate",
         "registration.features",

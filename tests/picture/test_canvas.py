@@ -7,8 +7,8 @@ import pytest
 
 from autoalign.errors import CanvasError
 from autoalign.geometry.homography import apply, translation
-from autoalign.picture.canvas import canvas, plane_canvas
-from autoalign.picture.warp import warp
+from autoalign.picture.canvas import canvas, largest_inner_box, plane_canvas
+from autoalign.picture.warp import valid_mask, valid_runs, warp
 
 # A picture of a floor, 600 x 400, horizon at row 100, looked at from 2 m above: the world is in metres, y towards us.
 FLOOR = np.array([[1.0, 0.0, -300.0], [0.0, 0.0, -500.0], [0.0, 0.005, -0.5]])
@@ -71,8 +71,59 @@ def test_too_many_pixels_are_refused_with_their_number():
 
 
 def test_an_unknown_kind_is_a_wrong_call():
-    with pytest.raises(ValueError, match='"fixed", "union" or "moving"'):
+    with pytest.raises(ValueError, match="kind must be one of fixed, union, intersection, inner, moving, not 'both'"):
         canvas("both", (5, 3), (5, 3), np.eye(3))
+
+
+def random_overlap(seed):
+    """A fixed size, a moving size and a tilted view that lies across the fixed picture's rim, now and then a sliver."""
+    rng = np.random.default_rng(seed)
+    fixed_size, moving_size = tuple(rng.integers(5, 30, 2).tolist()), tuple(rng.integers(2, 30, 2).tolist())
+    turn = rng.uniform(-np.pi, np.pi)
+    linear = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) * rng.uniform(0.3, 1.5)
+    transform = np.eye(3)
+    transform[:2, :2] = linear
+    transform[:2, 2] = np.array(fixed_size) * rng.uniform(-0.2, 1.0, 2)
+    transform[2, :2] = rng.uniform(-0.02, 0.02, 2)
+    return fixed_size, moving_size, transform
+
+
+def largest_box_by_trying_all(mask):
+    """Area of the largest box in which all of a mask (h, w) is True."""
+    sums = np.pad(mask.astype(int).cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    best = 0
+    for y0 in range(mask.shape[0]):
+        for x0 in range(mask.shape[1]):
+            filled = sums[y0 + 1 :, x0 + 1 :] - sums[y0, x0 + 1 :] - sums[y0 + 1 :, x0][:, None] + sums[y0, x0]
+            areas = np.outer(np.arange(1, mask.shape[0] - y0 + 1), np.arange(1, mask.shape[1] - x0 + 1))
+            best = max(best, int(areas[filled == areas].max(initial=0)))
+    return best
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_the_overlap_and_the_largest_box_within_it(seed):
+    fixed_size, moving_size, transform = random_overlap(seed)
+    mask = valid_mask(moving_size, fixed_size, transform)
+    if not mask.any():
+        for kind in ("intersection", "inner"):
+            with pytest.raises(CanvasError, match="do not overlap"):
+                canvas(kind, fixed_size, moving_size, transform)
+        return
+    around = canvas("intersection", fixed_size, moving_size, transform)
+    seen = valid_mask(moving_size, around.size, around.canvas_from_fixed @ transform)
+    assert seen.sum() == mask.sum()
+    assert seen.any(axis=0)[[0, -1]].all()
+    assert seen.any(axis=1)[[0, -1]].all()
+    within = canvas("inner", fixed_size, moving_size, transform)
+    assert valid_mask(moving_size, within.size, within.canvas_from_fixed @ transform).all()
+    assert within.size[0] * within.size[1] == largest_box_by_trying_all(mask)
+
+
+def test_the_largest_box_of_a_large_square_on_its_corner_has_half_its_area():
+    half = 3000
+    diamond = np.array([[1.0, -1.0, half], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    x0, y0, x1, y1 = largest_inner_box(*valid_runs((half + 1, half + 1), (2 * half + 1, 2 * half + 1), diamond))
+    assert (x1 - x0) * (y1 - y0) == (half + 1) * (half + 1)
 
 
 def test_a_plane_keeps_the_pictures_width():

@@ -1,4 +1,4 @@
-"""The frame a result is drawn in: the fixed picture's, one that holds both, or one that holds the moving one.
+"""The frame a result is drawn in: the fixed picture's, one that holds both pictures or the moving one, or their overlap.
 
 A picture covers [-0.5, w - 0.5] x [-0.5, h - 0.5], and so does a canvas. The canvas of a pair keeps the fixed picture's
 pixel grid, so that fixed pixels are copied and only the moving ones resampled.
@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from autoalign.errors import CanvasError
 from autoalign.geometry.homography import project, scaling, translation
+from autoalign.picture.warp import valid_runs
 
-CanvasKind = Literal["fixed", "union", "moving"]
+CanvasKind = Literal["fixed", "union", "intersection", "inner", "moving"]
+KINDS: tuple[CanvasKind, ...] = get_args(CanvasKind)
 
 # A canvas may have this many times the pixels that went in, and always this many.
 MAX_GROWTH = 4
@@ -60,26 +62,21 @@ def canvas(
 ) -> Canvas:
     """The frame for a pair of pictures of sizes (w, h) and the transform (3, 3) between them.
 
-    "fixed": the fixed picture's own frame. "union": the smallest that holds both. "moving": the smallest that holds
-    the moving picture as it lies on the fixed one. `max_pixels` is by default four times the pixels of both pictures
-    together, and at least 16 million.
+    "fixed": the fixed picture's own frame. "union": the smallest that holds both. "intersection": the smallest that
+    holds every fixed pixel where the moving picture has data. "inner": the largest in which every pixel has data of
+    both. "moving": the smallest that holds the moving picture as it lies on the fixed one. `max_pixels` is by default
+    four times the pixels of both pictures together, and at least 16 million.
 
-    Raises CanvasError where the horizon crosses a moving picture that must fit in, or the frame has too many pixels;
-    ValueError for another kind.
+    Raises CanvasError where the pictures do not overlap and the frame is to be of their overlap, the horizon crosses a
+    moving picture that must fit in, or the frame has too many pixels; ValueError for another kind.
     """
-    fixed_bounds = _bounds(_outline(fixed_size))
-    if kind == "fixed":
-        low, high = fixed_bounds
-    elif kind in ("union", "moving"):
-        low, high = _bounds(_whole_picture(moving_size, fixed_from_moving, _centre(moving_size), "the moving picture"))
-        if kind == "union":
-            low, high = np.minimum(low, fixed_bounds[0]), np.maximum(high, fixed_bounds[1])
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}")
+    if kind in ("intersection", "inner"):
+        x0, y0, x1, y1 = _box_of_overlap(kind, fixed_size, moving_size, fixed_from_moving)
     else:
-        raise ValueError(f'kind must be "fixed", "union" or "moving", not {kind!r}')
-    # 0.5: the left edge of pixel n is at n - 0.5, and the canvas begins with a whole pixel of the fixed grid.
-    x0, y0 = (math.floor(v + 0.5 + EDGE_PX) for v in low.tolist())
-    x1, y1 = (math.ceil(v + 0.5 - EDGE_PX) for v in high.tolist())
-    size = (max(1, x1 - x0), max(1, y1 - y0))
+        x0, y0, x1, y1 = _box_of_pictures(kind, fixed_size, moving_size, fixed_from_moving)
+    size = (x1 - x0, y1 - y0)
     if max_pixels is None:
         max_pixels = default_max_pixels(fixed_size, moving_size)
     _check_pixels(size, max_pixels)
@@ -149,6 +146,55 @@ def plane_canvas(
 def default_max_pixels(*sizes: tuple[int, int]) -> int:
     """Pixels a canvas may have, made from pictures of these sizes (w, h)."""
     return max(ALWAYS_ALLOWED_PIXELS, MAX_GROWTH * sum(w * h for w, h in sizes))
+
+
+def _box_of_pictures(
+    kind: CanvasKind, fixed_size: tuple[int, int], moving_size: tuple[int, int], fixed_from_moving: NDArray[np.float64]
+) -> tuple[int, int, int, int]:
+    """x0, y0, x1, y1 of the fixed picture's pixel grid that hold whole pictures."""
+    low, high = fixed_bounds = _bounds(_outline(fixed_size))
+    if kind != "fixed":
+        low, high = _bounds(_whole_picture(moving_size, fixed_from_moving, _centre(moving_size), "the moving picture"))
+    if kind == "union":
+        low, high = np.minimum(low, fixed_bounds[0]), np.maximum(high, fixed_bounds[1])
+    # 0.5: the left edge of pixel n is at n - 0.5, and the canvas begins with a whole pixel of the fixed grid.
+    x0, y0 = (math.floor(v + 0.5 + EDGE_PX) for v in low.tolist())
+    x1, y1 = (math.ceil(v + 0.5 - EDGE_PX) for v in high.tolist())
+    return x0, y0, max(x0 + 1, x1), max(y0 + 1, y1)
+
+
+def _box_of_overlap(
+    kind: CanvasKind, fixed_size: tuple[int, int], moving_size: tuple[int, int], fixed_from_moving: NDArray[np.float64]
+) -> tuple[int, int, int, int]:
+    """x0, y0, x1, y1 around the fixed pixels where the moving picture has data, or within them."""
+    starts, stops = valid_runs(moving_size, fixed_size, fixed_from_moving)
+    rows = np.flatnonzero(starts < stops)
+    if not len(rows):
+        raise CanvasError("the pictures do not overlap, so that their overlap is no canvas")
+    if kind == "inner":
+        return largest_inner_box(starts, stops)
+    return int(starts[rows].min()), int(rows[0]), int(stops[rows].max()), int(rows[-1]) + 1
+
+
+def largest_inner_box(starts: NDArray[np.intp], stops: NDArray[np.intp]) -> tuple[int, int, int, int]:
+    """x0, y0, x1, y1 of the largest box all of whose pixels lie in the runs starts[y] <= x < stops[y], each (h,).
+
+    The runs must be those of a convex shape: then what two rows have in common, all rows between them have, and the
+    box is found among all pairs of rows. Of several that are equally large it is the topmost.
+    """
+    best, box = 0, (0, 0, 0, 0)
+    heights = np.arange(1, len(starts) + 1)
+    for top in np.flatnonzero(starts < stops).tolist():
+        if (stops[top] - starts[top]) * (len(starts) - top) <= best:
+            continue
+        widths = np.minimum(stops[top:], stops[top]) - np.maximum(starts[top:], starts[top])
+        areas = widths * heights[: len(widths)]
+        most = int(areas.argmax())
+        if areas[most] > best:
+            bottom = top + most
+            best = int(areas[most])
+            box = int(max(starts[top], starts[bottom])), top, int(min(stops[top], stops[bottom])), bottom + 1
+    return box
 
 
 def _check_pixels(size: tuple[int, int], max_pixels: int) -> None:

@@ -43,6 +43,11 @@ def has_alpha(image: Picture) -> bool:
     return image.ndim == 3 and image.shape[2] in (2, 4)
 
 
+def full_scale(image: Picture) -> float:
+    """The value that stands for full opacity, and for white: 1 for float32, else the largest of the dtype."""
+    return 1.0 if image.dtype == np.float32 else float(np.iinfo(image.dtype).max)
+
+
 def opaque(image: Picture) -> NDArray[np.bool_] | None:
     """(h, w) True where an alpha channel is not zero; None for a picture without one."""
     return image[..., -1] > 0 if has_alpha(image) else None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autoalign.geometry.homography import invert, project, translation
-from autoalign.picture.pixels import Picture, check_picture, has_alpha, size_of
+from autoalign.picture.pixels import Picture, check_picture, full_scale, has_alpha, size_of
 
 Interpolation = Literal["linear", "nearest"]
 
@@ -306,8 +306,7 @@ def _bilinear_under_alpha(src: Picture, dst: Picture, src_from_dst: NDArray[np.f
     alpha = cv2.extractChannel(src, src.shape[2] - 1)
     if alpha.min() == alpha.max():
         return
-    most = 1 if src.dtype == np.float32 else np.iinfo(src.dtype).max
-    weight = alpha.astype(np.float32) / most + np.float32(TRANSPARENT_WEIGHT)
+    weight = alpha.astype(np.float32) / full_scale(src) + np.float32(TRANSPARENT_WEIGHT)
     total = _bilinear_plane(weight, size_of(dst), src_from_dst)
     for channel in range(src.shape[2] - 1):
         mean = _bilinear_plane(src[..., channel] * weight, size_of(dst), src_from_dst) / total

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from autoalign.geometry.homography import Array
+from autoalign.picture.border import Border, bordered
 from autoalign.picture.canvas import Canvas, CanvasKind, canvas
 from autoalign.picture.pixels import Picture, size_of
 from autoalign.picture.warp import Interpolation, Warped, warp
@@ -17,14 +18,16 @@ class Drawing:
     """How the moving picture is drawn."""
 
     canvas: CanvasKind = "fixed"
-    """frame of the aligned picture: FIXED's own, one that holds both, or one that holds all of MOVING as it lies"""
+    """frame of the result: FIXED's own, one that holds both, their overlap, the largest box inside it, or all of MOVING"""
+    border: Border = "constant"
+    """where there is no data: see-through, which needs alpha; black; or the nearest pixel repeated"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Drawn:
     """The moving picture as it was drawn, and the frame it was drawn in."""
 
-    warped: Warped
+    warped: Warped  # with its border
     frame: Canvas
 
 
@@ -38,11 +41,11 @@ def draw(
 ) -> Drawn:
     """`moving` (h, w) or (h, w, c) through a transform (3, 3) onto a fixed picture of size (w, h).
 
-    Raises CanvasError where no canvas can hold what `drawing` asks for.
+    Raises CanvasError where no canvas can hold what `drawing` asks for, ValueError for what no drawing can ask for.
     """
     frame = canvas(drawing.canvas, fixed_size, size_of(moving), fixed_from_moving)
     warped = warp(moving, frame.size, frame.canvas_from_fixed @ fixed_from_moving, interpolation=interpolation)
-    return Drawn(warped=warped, frame=frame)
+    return Drawn(warped=replace(warped, pixels=bordered(warped, drawing.border)), frame=frame)
 
 
 def warp_onto_fixed(
