@@ -101,7 +101,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "tifffile": ("files.tiff",),
 }
 
-NOT_LOADED_BY_IMPORT = ("rerun", "typer", "cyclopts", "rich", "fastapi", "distributed", "cv2", "skimage", "numpy")
+NOT_LOADED_BY_IMPORT = ("rerun", "typer", "cyclopts", "rich", "fastapi", "dask", "cv2", "skimage", "numpy")
 
 
 def modules() -> dict[str, Path]:

@@ -7,13 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from autoalign.errors import ImageReadError
-from autoalign.files.read import LoadedPicture, read_picture
+from autoalign.errors import ImageWriteError
+from autoalign.files.formats import PNG, TIFF, of_name
 from autoalign.files.write import check_format, check_writable
-from autoalign.picture.pixels import Picture, size_of
+from autoalign.picture.pixels import Picture
 
 SCREEN_PIXEL: Picture = np.zeros((1, 1, 3), np.uint8)
 """What a picture made for the eye is made of."""
+
+
+def check_mask_format(path: Path | None) -> None:
+    """Raise ImageWriteError, the path last, unless it is a name for a format that keeps black and white apart."""
+    if path is not None and of_name(path) not in (PNG, TIFF):
+        raise ImageWriteError(f"a mask is written as PNG or TIFF: {path}")
 
 
 def check_outputs(
@@ -34,12 +40,3 @@ def check_outputs(
         if pixels is not None:
             check_format(path, pixels)
         check_writable(path, overwrite)
-
-
-def read_sized(path: Path, size: tuple[int, int]) -> LoadedPicture:
-    """Read a picture that must be of `size` (w, h). Raises ImageReadError, the path last."""
-    loaded = read_picture(path)
-    if size_of(loaded.pixels) != size:
-        (w, h), (wanted_w, wanted_h) = size_of(loaded.pixels), size
-        raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {path}")
-    return loaded

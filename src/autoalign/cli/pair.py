@@ -8,11 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from cyclopts import Group, Parameter
-from numpy.typing import NDArray
 
-from autoalign.cli.files import SCREEN_PIXEL, check_outputs, read_sized
+from autoalign.cli.files import SCREEN_PIXEL, check_mask_format, check_outputs
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
 from autoalign.cli.view import Viewing, check_viewing, recording_beside, show
 from autoalign.files.points import CORRESPONDENCES, read_points
@@ -20,10 +18,13 @@ from autoalign.files.read import LoadedPicture, read_picture
 from autoalign.files.record import record
 from autoalign.files.result import ResultFiles, write_result
 from autoalign.files.sidecar import default_sidecar, sidecar_text, write_sidecar
+from autoalign.files.sized import read_mask
 from autoalign.files.write import default_output
+from autoalign.geometry.homography import Mask
 from autoalign.geometry.ransac import RansacOptions
+from autoalign.picture.border import like_bordered
 from autoalign.picture.compose import STYLES
-from autoalign.picture.pixels import grey, size_of
+from autoalign.picture.pixels import size_of
 from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment, AlignOptions
 from autoalign.registration.drawing import Drawing
@@ -45,6 +46,8 @@ class PairFiles:
 
     output: Annotated[Path | None, Parameter(alias="-o")] = None
     """the aligned picture; by default <MOVING>_aligned<ext> beside MOVING"""
+    save_mask: Path | None = None
+    """also write where the result has data, in its frame: a PNG or TIFF, white for data"""
     overlay: Path | None = None
     """also write both pictures as one, to look at"""
     overlay_style: Annotated[str, Parameter(choices=tuple(STYLES))] = "mean"
@@ -83,12 +86,14 @@ def pair(
     """
     started = time.perf_counter()
     still, mover = read_picture(fixed), read_picture(moving)
-    output = files.output or default_output(moving, mover.pixels)
+    drawn = like_bordered(mover.pixels, drawing.border)
+    output = files.output or default_output(moving, drawn)
     sidecar = None if files.json == STDOUT else files.json or default_sidecar(output)
     beside = recording_beside(sidecar or default_sidecar(output))
     recording = check_viewing(viewing, beside)
+    check_mask_format(files.save_mask)
     check_outputs(
-        [(output, mover.pixels), (files.overlay, SCREEN_PIXEL), (sidecar, None), (recording, None)],
+        [(output, drawn), (files.save_mask, None), (files.overlay, SCREEN_PIXEL), (sidecar, None), (recording, None)],
         inputs=[fixed, moving, files.points, files.fixed_mask, files.moving_mask],
         overwrite=common.overwrite,
     )
@@ -97,6 +102,7 @@ def pair(
     if alignment.status != "rejected":
         pictures = ResultFiles(
             aligned=output if alignment.status == "aligned" else None,
+            mask=files.save_mask if alignment.status == "aligned" else None,
             overlay=files.overlay,
             overlay_style=files.overlay_style,
         )
@@ -148,9 +154,8 @@ def _align(fixed: LoadedPicture, moving: LoadedPicture, files: PairFiles, option
     return align_points(points[:, :2], points[:, 2:], size_of(fixed.pixels), size_of(moving.pixels), options)
 
 
-def _usable(mask: Path | None, picture: LoadedPicture) -> NDArray[np.bool_] | None:
-    """(h, w) True where the mask is black, that is, where nothing of the picture is to be ignored."""
-    return None if mask is None else grey(read_sized(mask, size_of(picture.pixels)).pixels) == 0
+def _usable(mask: Path | None, picture: LoadedPicture) -> Mask | None:
+    return None if mask is None else read_mask(mask, size_of(picture.pixels)).valid
 
 
 def _tell_stages(alignment: Alignment) -> None:

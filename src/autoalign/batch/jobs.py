@@ -1,0 +1,80 @@
+"""What is to be done with one pair of a batch, and the key by which it is known to be done already."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from autoalign import __version__
+from autoalign.files.write import default_output
+from autoalign.registration.alignment import AlignOptions
+from autoalign.registration.drawing import Drawing
+
+Recorded = Literal["none", "failed", "all"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobOptions:
+    """What many jobs of a batch have in common."""
+
+    align: AlignOptions = AlignOptions()
+    drawing: Drawing = Drawing()
+    recorded: Recorded = "none"  # which pairs leave a recording for the viewer; failed: all but the aligned ones
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One moving picture, the fixed one it goes onto, and where the result goes."""
+
+    name: str  # unique in its batch: the moving picture's path below the batch's folder, with slashes
+    fixed: str  # a path
+    moving: str
+    out_dir: str
+    options: JobOptions = JobOptions()
+    fixed_mask: str | None = None  # a picture that is not black where the fixed one is to be ignored
+    moving_mask: str | None = None
+
+    @property
+    def output(self) -> Path:
+        """The aligned picture: the moving one's name and format, or a format that can be written behind its name."""
+        suffix = default_output(self.name).suffix
+        path = Path(self.out_dir, *PurePosixPath(self.name).parts)
+        return path if path.suffix == suffix else path.with_name(path.name + suffix)
+
+    @property
+    def sidecar(self) -> Path:
+        """With the whole name, because a camera writes IMG_1.CR2 and IMG_1.JPG into one folder."""
+        return self._beside(".autoalign.json")
+
+    @property
+    def recording(self) -> Path:
+        return self._beside(".autoalign.rrd")
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return tuple(path for path in (self.fixed, self.moving, self.fixed_mask, self.moving_mask) if path)
+
+    def _beside(self, ending: str) -> Path:
+        return Path(self.out_dir, *PurePosixPath(self.name + ending).parts)
+
+
+def key(job: Job, hash_of: Callable[[str], str]) -> str:
+    """Hexadecimal name of a job: equal exactly where inputs, options and version, and so the results, are equal.
+
+    `hash_of` gives the hash of the content behind a path.
+    """
+    inputs = [path and hash_of(path) for path in (job.fixed, job.moving, job.fixed_mask, job.moving_mask)]
+    words = [job.name, *(word or "" for word in inputs), _digest(job.options)]
+    return hashlib.sha256("\0".join(words).encode("utf-8", "surrogateescape")).hexdigest()
+
+
+@lru_cache(maxsize=1024)
+def _digest(options: JobOptions) -> str:
+    """Of everything but the inputs; a batch has few options and many jobs."""
+    text = json.dumps({"version": __version__, "options": asdict(options)}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,145 @@
+"""The jobs of a manifest: a CSV with a pair in every row, and options of its own where it wants them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from autoalign.batch.jobs import Job, JobOptions
+from autoalign.errors import ImageReadError
+from autoalign.files.formats import of_name
+
+NEEDED, OWN = ("fixed", "moving"), ("name", "fixed_mask", "moving_mask")
+
+
+def manifest_jobs(text: str, source: str, base: Path, out_dir: Path, options: JobOptions) -> list[Job]:
+    """The rows of a CSV with the columns fixed, moving and, if wanted, name, fixed_mask, moving_mask and options.
+
+    Paths are relative to `base`. An option's column has the option's name, with - or _, and an empty cell leaves that
+    option as `options` have it. A picture without a name is called by its path below the folder that the moving
+    pictures share. Raises ImageReadError with the line, `source` last, for what cannot be understood.
+    """
+    try:
+        rows = list(_rows(text))
+        if not rows:
+            raise ValueError("has no rows")
+        names = _names([_absolute(base, row["moving"]) for _, row in rows])
+        return [_job(line, row, name, base, out_dir, options) for (line, row), name in zip(rows, names, strict=True)]
+    except (ValueError, csv.Error) as error:
+        raise ImageReadError(f"is no manifest ({error}): {source}") from None
+
+
+def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
+    """(line, cells that are not empty by column) of the rows that say something."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True, skipinitialspace=True)
+    columns: list[str] | None = None
+    for cells in reader:
+        cells = [cell.strip() for cell in cells]
+        if not any(cells) or cells[0].startswith("#"):
+            continue
+        if columns is None:
+            columns = _columns(cells)
+        elif len(cells) != len(columns):
+            raise ValueError(f"line {reader.line_num} has {len(cells)} cells, the first line {len(columns)}")
+        else:
+            yield reader.line_num, {column: cell for column, cell in zip(columns, cells, strict=True) if cell}
+
+
+def _columns(names: Sequence[str]) -> list[str]:
+    columns = [name.lower().replace("-", "_") for name in names]
+    known = {*NEEDED, *OWN, *_option_types(JobOptions)}
+    for column in columns:
+        if columns.count(column) > 1:
+            raise ValueError(f"names the column {column} twice")
+        if column not in known:
+            raise ValueError(f"has the column {column}, which is no option")
+    missing = [column for column in NEEDED if column not in columns]
+    if missing:
+        raise ValueError(f"lacks the column {missing[0]}")
+    return columns
+
+
+def _job(line: int, row: Mapping[str, str], name: str, base: Path, out_dir: Path, options: JobOptions) -> Job:
+    try:
+        missing = [column for column in NEEDED if column not in row]
+        if missing:
+            raise ValueError(f"{missing[0]} is empty")
+        masks = {column: _absolute(base, row[column]) for column in ("fixed_mask", "moving_mask") if column in row}
+        return Job(
+            name=_inside(_with_extension(row.get("name", name), row["moving"])),
+            fixed=_absolute(base, row["fixed"]),
+            moving=_absolute(base, row["moving"]),
+            out_dir=str(out_dir),
+            options=with_cells(options, {key: cell for key, cell in row.items() if key not in (*NEEDED, *OWN)}),
+            **masks,
+        )
+    except ValueError as error:
+        raise ValueError(f"line {line}: {error}") from None
+
+
+def _names(paths: Sequence[str]) -> list[str]:
+    """What pictures are called if the manifest does not say: their paths below the folder that they share."""
+    shared = os.path.commonpath([os.path.dirname(path) for path in paths])
+    return [Path(path).relative_to(shared).as_posix() for path in paths]
+
+
+def _absolute(base: Path, path: str) -> str:
+    return os.path.normpath(base / path)
+
+
+def _with_extension(name: str, moving: str) -> str:
+    """A result has the moving picture's format, unless its name says another."""
+    return name if of_name(Path(name)) else name + Path(moving).suffix
+
+
+def _inside(name: str) -> str:
+    """A name that stays in the batch's folder."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    if path.is_absolute() or ".." in path.parts or not path.name or "\0" in name:
+        raise ValueError(f"{name!r} is no name inside the folder of the results")
+    return path.as_posix()
+
+
+def with_cells(options: Any, cells: Mapping[str, str]) -> Any:
+    """A dataclass, and those inside it, with the fields of these names read from text.
+
+    Raises ValueError for a text that a field does not take.
+    """
+    types, changes = get_type_hints(type(options)), {}
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if is_dataclass(value):
+            changes[field.name] = with_cells(value, cells)
+        elif field.name in cells:
+            changes[field.name] = _value(field.name, cells[field.name], types[field.name])
+    return replace(options, **changes)
+
+
+def _option_types(kind: type) -> dict[str, Any]:
+    """Name to type of all fields of a dataclass and of those inside it."""
+    found: dict[str, Any] = {}
+    for name, hint in get_type_hints(kind).items():
+        found |= _option_types(hint) if is_dataclass(hint) else {name: hint}
+    return found
+
+
+def _value(name: str, text: str, hint: Any) -> Any:
+    """A cell as the type that a field has."""
+    if get_origin(hint) is Literal:
+        if text not in get_args(hint):
+            raise ValueError(f"{name} is one of {', '.join(get_args(hint))}, not {text}")
+        return text
+    kinds = [kind for kind in (get_args(hint) or (hint,)) if kind is not type(None)]
+    if kinds[0] is bool:
+        if text.lower() not in ("true", "false", "yes", "no", "1", "0"):
+            raise ValueError(f"{name} is true or false, not {text}")
+        return text.lower() in ("true", "yes", "1")
+    try:
+        return kinds[0](text)
+    except ValueError:
+        raise ValueError(f"{name} is a number, not {text}") from None

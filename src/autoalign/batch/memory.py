@@ -1,0 +1,72 @@
+"""The pictures that a worker keeps: read and prepared once while they fit, since a batch meets many of them again."""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+
+from autoalign.files.feature_store import recall_from
+from autoalign.files.read import LoadedPicture, read_picture
+from autoalign.files.sized import read_mask
+from autoalign.picture.pixels import size_of
+from autoalign.registration.prepared import Prepared, prepare
+
+MAX_BYTES = 512 * 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ready:
+    """A picture as its file has it, and as it is aligned."""
+
+    loaded: LoadedPicture
+    prepared: Prepared
+
+    @property
+    def nbytes(self) -> int:
+        return self.loaded.pixels.nbytes + self.prepared.nbytes
+
+
+class PictureMemory:
+    """The pictures used last, within a bound; a file that was changed is read again."""
+
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self._max_bytes = max_bytes
+        self._kept: OrderedDict[tuple[object, ...], Ready] = OrderedDict()
+
+    def ready(self, path: str, mask: str | None = None, store: str | None = None) -> Ready:
+        """The picture of a file, its features kept in the folder `store` if one is given.
+
+        `mask` is a picture of the same size that is not black where this one is to be ignored. Raises ImageReadError.
+        """
+        stamp = (path, _stamp(path), mask, mask and _stamp(mask), store)
+        found = self._kept.pop(stamp, None) or _read(path, mask, store)
+        self._kept[stamp] = found
+        self._shrink()
+        return found
+
+    def _shrink(self) -> None:
+        """Forget what was not used for longest; the last one stays, whatever its size."""
+        total = sum(ready.nbytes for ready in self._kept.values())
+        while total > self._max_bytes and len(self._kept) > 1:
+            _, oldest = self._kept.popitem(last=False)
+            total -= oldest.nbytes
+
+
+def _read(path: str, mask: str | None, store: str | None) -> Ready:
+    loaded = read_picture(path)
+    hidden = read_mask(Path(mask), size_of(loaded.pixels)) if mask else None
+    identity = f"{loaded.sha256} {hidden.sha256 if hidden else ''}"
+    valid = hidden.valid if hidden else None
+    recall = recall_from(Path(store), identity) if store else None
+    return Ready(loaded=loaded, prepared=prepare(loaded.pixels, valid, recall=recall))
+
+
+def _stamp(path: str) -> tuple[int, ...] | None:
+    """What changes with a file's content; None for a file that is not there, which reading it will say."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return found.st_size, found.st_mtime_ns, found.st_ino

@@ -1,0 +1,37 @@
+"""Pictures and masks that must have the size of another picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from autoalign.errors import ImageReadError
+from autoalign.files.read import LoadedPicture, read_picture
+from autoalign.geometry.homography import Mask
+from autoalign.picture.pixels import grey, size_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedMask:
+    """A mask from a file."""
+
+    valid: Mask  # (h, w) True where the file is black, that is, where nothing is to be ignored
+    sha256: str  # of the file's bytes
+
+
+def read_sized(path: Path, size: tuple[int, int]) -> LoadedPicture:
+    """Read a picture that must be of `size` (w, h). Raises ImageReadError, the path last."""
+    loaded = read_picture(path)
+    if size_of(loaded.pixels) != size:
+        (w, h), (wanted_w, wanted_h) = size_of(loaded.pixels), size
+        raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {path}")
+    return loaded
+
+
+def read_mask(path: Path, size: tuple[int, int]) -> LoadedMask:
+    """Read the mask of a picture of `size` (w, h), which is not black where that picture is to be ignored.
+
+    Raises ImageReadError, the path last.
+    """
+    loaded = read_sized(path, size)
+    return LoadedMask(valid=grey(loaded.pixels) == 0, sha256=loaded.sha256)
