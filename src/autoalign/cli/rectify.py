@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from autoalign.cli.files import check_outputs
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
+from autoalign.files.metadata import without_grid
 from autoalign.files.points import PLANE_POINTS, read_points
 from autoalign.files.read import read_picture
 from autoalign.files.write import default_output, write_picture
@@ -55,7 +56,7 @@ def rectify(
     x, y = on_image.mean(axis=0).tolist()
     plane = plane_canvas(size_of(loaded.pixels), world_from_image, options.scale, anchor=(x, y))
     drawn = warp(loaded.pixels, plane.size, plane.canvas_from_image, anchor=plane.anchor)
-    write_picture(output, drawn.pixels, loaded.metadata, overwrite=common.overwrite)
+    write_picture(output, drawn.pixels, without_grid(loaded.metadata), overwrite=common.overwrite)
     if plane.cropped:
         note(plane.cropped, common)
     if not common.quiet:

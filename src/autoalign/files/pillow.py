@@ -14,7 +14,8 @@ from PIL import Image
 from PIL.ImageFile import ImageFile
 
 from autoalign.files.codec import Decoder, Encoder, Header, Refused
-from autoalign.files.metadata import Metadata, exif_orientation, resolution, without_prefix
+from autoalign.files.exif import exif_orientation, with_resolution, without_prefix
+from autoalign.files.metadata import Metadata, resolution
 from autoalign.picture.pixels import Picture
 
 MODES = {"1": "L", "P": "RGB"}  # how Pillow is to hand over what is no picture of ours
@@ -45,7 +46,11 @@ def webp_encoder() -> Encoder:
     """Lossless: grey (which becomes RGB, WebP knows no other) or RGB, uint8, with or without alpha."""
 
     def encode(pixels: Picture, metadata: Metadata) -> bytes:
-        blocks = {"icc_profile": metadata.icc, "exif": metadata.exif, "xmp": metadata.xmp}
+        blocks = {
+            "icc_profile": metadata.icc,
+            "exif": with_resolution(metadata.exif, metadata.dpi),
+            "xmp": metadata.xmp,
+        }
         present = {name: block for name, block in blocks.items() if block}
         # Exact: the colour under full transparency stays too.
         return _saved(pixels, "WEBP", lossless=True, exact=True, **present)

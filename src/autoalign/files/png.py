@@ -11,7 +11,8 @@ import imagecodecs
 import numpy as np
 
 from autoalign.files.codec import Decoder, Encoder, Header
-from autoalign.files.metadata import Metadata, exif_orientation, resolution, without_prefix
+from autoalign.files.exif import exif_orientation, without_prefix
+from autoalign.files.metadata import MAX_METADATA, Metadata, resolution
 from autoalign.picture.pixels import Picture
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -19,7 +20,6 @@ PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 XMP = b"XML:com.adobe.xmp\0"
 HEADER_END = len(SIGNATURE) + 25  # IHDR is always the first chunk and always of this length
 INCHES_PER_METRE = 1 / 0.0254
-MAX_METADATA = 1 << 26  # bytes; a compressed block that grows beyond this is a bomb
 
 # libpng's warnings arrive as log records; without a handler Python would print them.
 logging.getLogger("imagecodecs").addHandler(logging.NullHandler())

@@ -1,9 +1,13 @@
-"""TIFF and BigTIFF: tifffile with the compressions of imagecodecs; metadata in the tags."""
+"""TIFF and BigTIFF: tifffile with the compressions of imagecodecs; metadata in the tags.
+
+What other formats keep in an EXIF block stands here in the page's own directory, and in those that it points to.
+"""
 
 from __future__ import annotations
 
 import io
 import logging
+import struct
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -11,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tifffile
 
+from autoalign.files import exif, microscope
 from autoalign.files.codec import Decoder, Encoder, Header, Refused
-from autoalign.files.metadata import CM_PER_INCH, Metadata, resolution
-from autoalign.picture.pixels import DTYPES, Picture, has_alpha
+from autoalign.files.georeference import NO_DATA, georeference_of
+from autoalign.files.metadata import Metadata, resolution
+from autoalign.picture.pixels import DTYPES, Picture, has_alpha, size_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,8 +35,11 @@ COLOURS = {
 """Samples that make the colour of a pixel, for the kinds of TIFF that are read; the others are refused by name."""
 ALPHAS = (EXTRASAMPLE.UNASSALPHA, EXTRASAMPLE.ASSOCALPHA)
 JPEG_COMPRESSION = 7  # the only one whose YCbCr pixels arrive as RGB
-INCHES_PER_UNIT = {2: 1.0, 3: 1 / CM_PER_INCH}  # the tag ResolutionUnit; 1 is an aspect ratio
-BYTE = 1  # TIFF type code
+XMP, ICC = 700, 34675
+PLACEHOLDERS = {exif.EXIF_IFD: "ExifTag", exif.GPS_IFD: "GPSTag"}  # tifffile lets them through by these names only
+MAX_PAGES = 65_536
+MAX_CLASSIC = 2**32 - 2**26  # bytes of pixels; with more, offsets may need more than 32 bits
+MAX_TILE = 2**26  # pixels of a tile or strip that is larger than its picture: tiles overhang, but not without end
 
 # Both write their complaints about damaged files to the log; without a handler Python would print them.
 for _name in ("tifffile", "imagecodecs"):
@@ -51,15 +60,10 @@ def _read_header(data: bytes, number: int) -> Header:
     with _page(data, number) as page:
         _check_readable(page)
         orientation = _tag(page, "Orientation", 1)
-        xmp = _tag(page, "XMP", None)
         return Header(
             size=(page.imagewidth, page.imagelength),
             orientation=orientation if orientation in range(1, 9) else 1,
-            metadata=Metadata(
-                icc=page.iccprofile or None,
-                xmp=xmp if isinstance(xmp, bytes) and xmp else None,
-                dpi=_read_dpi(page),
-            ),
+            metadata=_read_metadata(data, page, number),
         )
 
 
@@ -76,27 +80,32 @@ def _decode(data: bytes, number: int) -> Picture:
 
 def _encode(pixels: Picture, metadata: Metadata) -> bytes:
     stream = io.BytesIO()
-    tifffile.imwrite(
-        stream,
-        pixels,
-        photometric="minisblack" if pixels.ndim == 2 or pixels.shape[2] < 3 else "rgb",
-        planarconfig="contig" if pixels.ndim == 3 else None,
-        extrasamples=["unassalpha"] if has_alpha(pixels) else None,
-        compression="zlib",
-        predictor=True,
-        resolution=metadata.dpi,
-        resolutionunit="INCH" if metadata.dpi else None,
-        iccprofile=metadata.icc,
-        extratags=[(700, BYTE, len(metadata.xmp), metadata.xmp, True)] if metadata.xmp else [],
-        # Neither a description nor the name of the library: the bytes depend on the picture alone.
-        metadata=None,
-        software=False,
-    )
+    directory = exif.described(exif.directory_of(metadata.exif))
+    # The byte order of the camera: maker notes keep theirs.
+    layout = exif.Layout(order=_order(metadata.exif), big=pixels.nbytes > MAX_CLASSIC)
+    with tifffile.TiffWriter(stream, bigtiff=layout.big, byteorder=layout.order) as file:
+        file.write(
+            pixels,
+            photometric="minisblack" if pixels.ndim == 2 or pixels.shape[2] < 3 else "rgb",
+            planarconfig="contig" if pixels.ndim == 3 else None,
+            extrasamples=["unassalpha"] if has_alpha(pixels) else None,
+            compression="zlib",
+            predictor=True,
+            **_resolution(metadata),
+            iccprofile=metadata.icc,
+            extratags=_extra_tags(metadata, directory, size_of(pixels), layout),
+            # Neither a description nor the name of the library: the bytes depend on the picture alone.
+            metadata=None,
+            software=False,
+        )
+    _append_directories(stream, directory, layout)
     return stream.getvalue()
 
 
 @contextmanager
 def _page(data: bytes, number: int) -> Iterator[Any]:
+    if not 0 <= number < MAX_PAGES:
+        raise Refused(f"has no page {number} (pages count from 0)")
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         try:
             page = file.pages[number]
@@ -116,11 +125,15 @@ def _check_readable(page: Any) -> None:
     kind = page.photometric
     if kind not in COLOURS or (kind == PHOTOMETRIC.YCBCR and page.compression != JPEG_COMPRESSION):
         raise Refused(f"holds {getattr(kind, 'name', kind)} pixels; convert it to grey or RGB first")
+    w, h, samples = page.imagewidth, page.imagelength, page.samplesperpixel
+    tile = (page.tilewidth, page.tilelength) if page.is_tiled else (w, min(page.rowsperstrip, h))
+    if tile[0] * tile[1] > max(MAX_TILE, 4 * w * h):
+        raise ValueError(f"tiles of {tile[0]} x {tile[1]} pixels in a picture of {w} x {h}")
     if page.imagedepth != 1:
         raise Refused("holds a volume, not a picture")
     extra = tuple(page.extrasamples)
-    if page.samplesperpixel != COLOURS[kind] + len(extra) or extra not in ((), *((alpha,) for alpha in ALPHAS)):
-        raise Refused(f"has {page.samplesperpixel} channels that are not grey or RGB with or without alpha")
+    if samples != COLOURS[kind] + len(extra) or extra not in ((), *((alpha,) for alpha in ALPHAS)):
+        raise Refused(f"has {samples} channels that are not grey or RGB with or without alpha")
     if page.dtype is None or not (page.dtype == np.bool_ or page.dtype in DTYPES):
         raise Refused(f"holds {page.dtype or 'unknown'} pixels; autoalign takes uint8, uint16 and float32")
     if kind == PHOTOMETRIC.PALETTE and (page.dtype != np.uint8 or extra):
@@ -155,9 +168,71 @@ def _straight(pixels: Picture, page: Any) -> Picture:
     return np.concatenate([colours.astype(pixels.dtype), pixels[..., -1:]], axis=-1)
 
 
-def _read_dpi(page: Any) -> tuple[float, float] | None:
-    unit = _tag(page, "ResolutionUnit", 2)
+def _read_metadata(data: bytes, page: Any, number: int) -> Metadata:
+    layout = exif.Layout(order=page.parent.byteorder, big=page.parent.is_bigtiff)
+    directory = dict(exif.read_directory(data, page.offset, layout))
+    # A microscope describes all pictures of a file in the first one; other programs each its own.
+    written = page.parent.pages[0].description
+    scope = microscope.of_plane(written, number) if microscope.is_known(written) else None
+    if scope or microscope.is_known(page.description) or page.is_shaped:
+        directory.pop(exif.DESCRIPTION, None)
     x, y = (_tag(page, name, (0, 1)) for name in ("XResolution", "YResolution"))
-    if unit not in INCHES_PER_UNIT or 0 in (x[1], y[1]):
-        return None
-    return resolution(x[0] / x[1], y[0] / y[1], INCHES_PER_UNIT[unit])
+    ratio = resolution(x[0] / x[1], y[0] / y[1]) if x[1] and y[1] else None
+    dpi = exif.exif_dpi(directory)
+    xmp, no_data = directory.get(XMP), directory.get(NO_DATA)
+    return Metadata(
+        icc=page.iccprofile or None,
+        exif=exif.block_of(exif.described(directory), layout.order),
+        xmp=xmp.data or None if isinstance(xmp, exif.Tag) else None,
+        dpi=microscope.dpi_of(written, dpi, ratio) if scope else dpi,
+        georeference=georeference_of(directory),
+        no_data=no_data.text or None if isinstance(no_data, exif.Tag) else None,
+        microscope=scope,
+    )
+
+
+def _order(block: bytes | None) -> exif.Order:
+    return ">" if block and block.startswith(b"MM") else "<"
+
+
+def _resolution(metadata: Metadata) -> dict[str, Any]:
+    """What the writer is to say of the resolution, in the unit that goes with the description."""
+    if metadata.dpi is None:
+        return {}
+    own = microscope.tag_resolution(metadata.microscope, metadata.dpi) if metadata.microscope else None
+    return {"resolution": own or metadata.dpi, "resolutionunit": "NONE" if own else "INCH"}
+
+
+def _extra_tags(
+    metadata: Metadata, directory: exif.Directory, size: tuple[int, int], layout: exif.Layout
+) -> list[tuple[int | str, int, int, bytes | int, bool]]:
+    """All tags that the writer does not make itself, in its words; places to be filled for directories."""
+    tags: dict[int, exif.Tag | exif.Directory] = {**directory, **(metadata.georeference or {})}
+    texts = {NO_DATA: metadata.no_data}
+    if metadata.microscope:
+        texts[exif.DESCRIPTION] = microscope.with_grid(metadata.microscope, size, metadata.dpi)
+    tags |= {code: exif.Tag(type=exif.ASCII, data=text.encode() + b"\0") for code, text in texts.items() if text}
+    if metadata.xmp:
+        tags |= {XMP: exif.Tag(type=exif.BYTE, data=metadata.xmp)}
+    pointer = exif.LONG8 if layout.big else exif.LONG
+    return [
+        (code, item.type, item.count, item.in_order(layout.order), True)
+        if isinstance(item, exif.Tag)
+        else (PLACEHOLDERS[code], pointer, 1, 0, True)
+        for code, item in tags.items()
+        if isinstance(item, exif.Tag) or code in PLACEHOLDERS
+    ]
+
+
+def _append_directories(stream: io.BytesIO, directory: exif.Directory, layout: exif.Layout) -> None:
+    """Put the directories that a page points to at the end of the file, and where they are into their places."""
+    inner = {code: item for code, item in directory.items() if code in PLACEHOLDERS and not isinstance(item, exif.Tag)}
+    if not inner:
+        return
+    places, _ = exif.entry_places(stream.getvalue(), 8 if layout.big else 4, layout)
+    for code, item in inner.items():
+        at = stream.seek(0, io.SEEK_END)
+        at += stream.write(bytes(at % 2))  # directories begin at even places
+        stream.write(exif.pack_directory(item, layout, at))
+        stream.seek(places[code] + layout.entry_size - struct.calcsize(layout.offset))
+        stream.write(struct.pack(layout.offset, at))
