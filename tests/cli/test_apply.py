@@ -31,6 +31,21 @@ def test_the_same_picture_gives_what_pair_gave(sidecar, run):
     assert aa.read_picture("other.png").pixels.shape == (400, 600, 3)
 
 
+def test_border_and_mask_are_those_that_pair_was_told(sidecar, run):
+    words = ("--border", "transparent", "--canvas", "union", "--save-mask")
+    run("pair", "fixed.jpg", "moving.jpg", "--points", "typed.csv", "-o", "pair.png", *words, "pair_mask.png")
+    outcome = run("apply", "pair.autoalign.json", "moving.jpg", "--save-mask", "mask.png")
+    assert (outcome.code, outcome.err) == (0, "wrote moving_aligned.png, mask.png\n")  # no JPEG, which has no alpha
+    folder = sidecar.parent
+    assert (folder / "moving_aligned.png").read_bytes() == (folder / "pair.png").read_bytes()
+    assert (folder / "mask.png").read_bytes() == (folder / "pair_mask.png").read_bytes()
+    assert run("apply", "pair.autoalign.json", "moving.jpg", "-o", "black.jpg", "--border", "constant").code == 0
+    refused = run("apply", "pair.autoalign.json", "moving.jpg", "-o", "clear.jpg")
+    assert refused.code == 3
+    assert "JPEG cannot hold" in refused.err
+    assert run("apply", sidecar, "moving.jpg", "other.jpg", "--save-mask", "mask.png").code == 2
+
+
 def test_labels_are_not_mixed(sidecar, run):
     labels = np.kron(np.random.default_rng(0).choice([0, 7, 200], (42, 48)), np.ones((10, 10))).astype(np.uint8)
     aa.write_picture("labels.png", labels)

@@ -123,6 +123,39 @@ def test_a_larger_canvas_holds_more(sidecar, run, canvas):
         assert (height, width) == pytest.approx(expected, abs=2)
 
 
+@pytest.mark.parametrize("canvas", ["fixed", "intersection", "inner"])
+def test_the_mask_is_white_where_the_result_has_data(sidecar, run, canvas):
+    outcome = run("pair", "fixed.jpg", "moving.jpg", "--points", "typed.csv", "-o", "out.png", "--canvas", canvas,
+                  "--save-mask", "data.png", "--border", "transparent")  # fmt: skip
+    assert outcome.err.startswith("wrote out.png, data.png, out.autoalign.json")
+    pixels, mask = aa.read_picture("out.png").pixels, aa.read_picture("data.png").pixels
+    assert mask.dtype == np.uint8
+    assert np.array_equal(mask, pixels[..., 3])
+    # The moving picture lies wholly inside the fixed one: 40 % of this are data, and 51 % of the box around these.
+    shares = {"fixed": (0.39, 0.4), "intersection": (0.51, 0.52), "inner": (1.0, 1.0)}
+    low, high = shares[canvas]
+    assert low <= (mask == 255).mean() <= high
+    record = aa.read_sidecar("out.autoalign.json")
+    assert (record.options["canvas"], record.options["border"]) == (canvas, "transparent")
+
+
+def test_replicate_leaves_no_pixel_black(sidecar, run):
+    white = np.full((420, 480, 3), 255, np.uint8)
+    aa.write_picture("white.png", white)
+    run("pair", "fixed.jpg", "white.png", "--points", "typed.csv", "-o", "out.png", "--border", "replicate")
+    assert (aa.read_picture("out.png").pixels == 255).all()
+
+
+def test_what_cannot_be_see_through_is_refused_before_any_work(sidecar, run, monkeypatch):
+    monkeypatch.setattr(pair_module, "align_points", lambda *_, **__: pytest.fail("worked in vain"))
+    words = ("pair", "fixed.jpg", "moving.jpg", "--points", "typed.csv", "--border", "transparent")
+    refused = run(*words, "-o", "out.jpg")
+    assert refused.code == 3
+    assert re.fullmatch(r"autoalign: JPEG cannot hold .* with alpha; PNG or TIFF or .* can: out\.jpg\n", refused.err)
+    refused = run(*words, "--save-mask", "mask.jpg")
+    assert (refused.code, refused.err) == (3, "autoalign: a mask is written as PNG or TIFF: mask.jpg\n")
+
+
 def test_masks_are_white_where_to_ignore(pictures, run):
     mask = np.zeros((400, 600), np.uint8)
     mask[:, :250] = 255

@@ -9,13 +9,17 @@ from typing import Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from autoalign.cli.files import check_outputs, read_sized
+from autoalign.cli.files import SCREEN_PIXEL, check_mask_format, check_outputs
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, complain, note
 from autoalign.errors import ImageReadError, ImageWriteError
+from autoalign.files.metadata import on_grid_of
 from autoalign.files.points import POSITIONS, read_points, write_points
+from autoalign.files.result import write_mask
 from autoalign.files.sidecar import Sidecar, read_sidecar, transform_of
-from autoalign.files.write import default_output, write_picture
+from autoalign.files.sized import read_sized
+from autoalign.files.write import check_format, default_output, write_picture
 from autoalign.geometry.homography import invert, project
+from autoalign.picture.border import Border, like_bordered
 from autoalign.picture.canvas import CanvasKind
 from autoalign.picture.warp import Interpolation
 from autoalign.registration.drawing import Drawing, draw
@@ -33,6 +37,10 @@ class ApplyOptions:
     """linear for pictures; nearest for masks and labels, whose values must not be mixed"""
     canvas: CanvasKind | None = None
     """frame of the results; by default the one that `pair` was told"""
+    border: Border | None = None
+    """where there is no data: see-through, black, or the nearest pixel repeated; by default as `pair` was told"""
+    save_mask: Path | None = None
+    """also write where the result has data, in its frame: a PNG or TIFF, white for data; for one picture"""
     points: Path | None = None
     """map these points of MOVING to FIXED: CSV with the columns x, y; by default to <CSV>_on_fixed.csv beside it"""
     inverse: bool = False
@@ -61,36 +69,56 @@ def apply(
         raise ValueError("--inverse is for --points; pictures are always put onto the fixed one")
     if options.output and (options.out_dir or len(images) > 1):
         raise ValueError("--output names one file; use --out-dir for several")
+    if options.save_mask and len(images) != 1:
+        raise ValueError("--save-mask names one file, and is for one picture")
     record = read_sidecar(sidecar)
     if options.points:
         return _map_points(record, options.points, options, common)
-    outputs = [_output(image, options) for image in images]
-    check_outputs([(path, None) for path in outputs], inputs=[sidecar, *images], overwrite=common.overwrite)
+    drawing = _drawing(record, options)
+    outputs = [_output(image, options, drawing) for image in images]
+    check_mask_format(options.save_mask)
+    check_outputs(
+        [(path, None) for path in (*outputs, options.save_mask)],
+        inputs=[sidecar, *images],
+        overwrite=common.overwrite,
+    )
     worst = Exit.DONE
     for image, output in zip(images, outputs, strict=True):
         try:
-            _put(record, image, output, options, common)
+            _put(record, image, output, drawing, options, common)
         except (ImageReadError, ImageWriteError) as error:  # the others are still wanted
             complain(str(error))
             worst = Exit.FILE
     return worst
 
 
-def _output(image: Path, options: ApplyOptions) -> Path:
-    named = default_output(image)
+def _drawing(record: Sidecar, options: ApplyOptions) -> Drawing:
+    """As `pair` was told, where nobody says otherwise."""
+    told = {name: record.options[name] for name in ("canvas", "border") if name in record.options}
+    asked = {name: value for name in ("canvas", "border") if (value := getattr(options, name)) is not None}
+    return Drawing(**(told | asked))
+
+
+def _output(image: Path, options: ApplyOptions, drawing: Drawing) -> Path:
+    named = default_output(
+        image, like_bordered(SCREEN_PIXEL, drawing.border) if drawing.border == "transparent" else None
+    )
     if options.out_dir:
         return options.out_dir / f"{image.stem}{named.suffix}"
     return options.output or named
 
 
-def _put(record: Sidecar, image: Path, output: Path, options: ApplyOptions, common: Common) -> None:
+def _put(record: Sidecar, image: Path, output: Path, drawing: Drawing, options: ApplyOptions, common: Common) -> None:
     """One picture through the transform."""
     loaded = read_sized(image, record.moving.size)
+    check_format(output, like_bordered(loaded.pixels, drawing.border))
     transform = transform_of(record)
-    drawing = Drawing(canvas=options.canvas or record.options.get("canvas", "fixed"))
     drawn = draw(loaded.pixels, record.fixed.size, transform, drawing, interpolation=options.interpolation)
-    write_picture(output, drawn.warped.pixels, loaded.metadata, overwrite=common.overwrite)
-    note(f"wrote {output}", common)
+    metadata = on_grid_of(None, loaded.metadata, drawn.frame, transform, record.moving.size)
+    write_picture(output, drawn.warped.pixels, metadata, overwrite=common.overwrite)
+    if options.save_mask:
+        write_mask(options.save_mask, drawn.warped, common.overwrite)
+    note(f"wrote {', '.join(str(path) for path in (output, options.save_mask) if path)}", common)
 
 
 def _map_points(record: Sidecar, path: Path, options: ApplyOptions, common: Common) -> int:

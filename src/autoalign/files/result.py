@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from autoalign.files.metadata import on_grid_of
 from autoalign.files.read import LoadedPicture
 from autoalign.files.write import write_picture
 from autoalign.geometry.homography import Array
 from autoalign.picture.compose import compose
-from autoalign.picture.pixels import size_of
-from autoalign.picture.warp import warp
+from autoalign.picture.pixels import opaque, size_of
+from autoalign.picture.warp import Warped, warp
 from autoalign.registration.drawing import Drawing, Drawn, draw
 
 
@@ -19,6 +22,7 @@ class ResultFiles:
     """Where the pictures of a result go; None for one that is not wanted."""
 
     aligned: Path | None = None
+    mask: Path | None = None
     overlay: Path | None = None
     overlay_style: str = "mean"
 
@@ -36,16 +40,31 @@ def write_result(
     Raises CanvasError where no canvas can hold them, ImageWriteError as `write_picture` does.
     """
     written: list[Path] = []
-    if files.aligned is None and files.overlay is None:
+    if files == ResultFiles(overlay_style=files.overlay_style):
         return written
     drawn = draw(moving.pixels, size_of(fixed.pixels), fixed_from_moving, drawing)
     if files.aligned is not None:
-        write_picture(files.aligned, drawn.warped.pixels, moving.metadata, overwrite=overwrite)
+        size = size_of(moving.pixels)
+        metadata = on_grid_of(fixed.metadata, moving.metadata, drawn.frame, fixed_from_moving, size)
+        write_picture(files.aligned, drawn.warped.pixels, metadata, overwrite=overwrite)
         written.append(files.aligned)
+    if files.mask is not None:
+        write_mask(files.mask, drawn.warped, overwrite)
+        written.append(files.mask)
     if files.overlay is not None:
         _write_overlay(files.overlay, files.overlay_style, fixed, drawn, overwrite)
         written.append(files.overlay)
     return written
+
+
+def write_mask(path: Path, warped: Warped, overwrite: bool = False) -> None:
+    """Where a result has data, as a grey picture: white, and black where it has none or is wholly see-through.
+
+    Raises ImageWriteError as `write_picture` does.
+    """
+    seen = opaque(warped.pixels)
+    data = warped.valid if seen is None else warped.valid & seen
+    write_picture(path, data * np.uint8(255), overwrite=overwrite)
 
 
 def _write_overlay(path: Path, style: str, fixed: LoadedPicture, drawn: Drawn, overwrite: bool) -> None:

@@ -1,4 +1,4 @@
-"""The frame a result is drawn in: the fixed picture's, one that holds both pictures or the moving one, or their overlap.
+"""The frame a result is drawn in: the fixed picture's, one that holds both or the moving one, or one of their overlap.
 
 A picture covers [-0.5, w - 0.5] x [-0.5, h - 0.5], and so does a canvas. The canvas of a pair keeps the fixed picture's
 pixel grid, so that fixed pixels are copied and only the moving ones resampled.
