@@ -25,6 +25,8 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "selection",
             "chance",
             "uncertainty",
+            "graph",
+            "network",
         )
     },
     {"picture": ("pixels", "warp", "border", "canvas", "compose")},
@@ -42,6 +44,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "prepared",
             "mirror",
             "align",
+            "sequence",
             "drawing",
         )
     },
@@ -95,6 +98,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "psutil": ("batch.slot",),
     "rerun": ("views.viewer",),
     "rich": ("cli.terminal",),
+    "scipy": ("geometry.graph", "geometry.network"),
     "simplejpeg": ("files.jpeg",),
     "skimage": ("registration.alignment",),  # its ProjectiveTransform, for those who live there
     "threadpoolctl": ("batch.slot",),

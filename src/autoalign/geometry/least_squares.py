@@ -61,9 +61,13 @@ def velocities(model: Model, points: Array, norm: Array) -> Array:
 
 
 def step(model: Model, transform: Array, parameters: Array, norm: Array) -> Array:
-    """H exp(sum a_i G_i) of unit norm, the generators taken in the normalised frame."""
-    generator = np.einsum("g,gij->ij", parameters, model.generators)
-    halvings = max(0, int(np.ceil(np.log2(max(float(np.abs(generator).max()), 1e-300) / 0.1))))
+    """H exp(sum a_i G_i) of unit norm, the generators taken in the normalised frame.
+
+    Leading axes are batches: (..., 3, 3) transforms, (..., dof) parameters, (..., 3, 3) norms -> (..., 3, 3).
+    """
+    generator = np.einsum("...g,gij->...ij", parameters, model.generators)
+    largest = max(float(np.abs(generator).max(initial=0.0)), 1e-300)
+    halvings = max(0, int(np.ceil(np.log2(largest / 0.1))))
     scaled = generator / 2**halvings
     exponential, term = np.eye(3), np.eye(3)
     for k in range(1, 12):  # 0.3**12 / 12! is far under the rounding of a double

@@ -272,8 +272,8 @@ def _rejections(evidence: Evidence, options: VerdictOptions) -> list[tuple[str, 
     return found
 
 
-def _error_limit(options: VerdictOptions, fixed_size: tuple[int, int]) -> float:
-    """Expected error in px above which a pair is doubtful."""
+def error_limit(options: VerdictOptions, fixed_size: tuple[int, int]) -> float:
+    """Expected error in px above which a pair is doubtful; `fixed_size` is (w, h)."""
     return max(options.max_expected_error_px, options.max_expected_error_share * float(np.hypot(*fixed_size)))
 
 
@@ -281,7 +281,7 @@ def _doubts(
     evidence: Evidence, error: float, options: VerdictOptions, fixed_size: tuple[int, int]
 ) -> list[tuple[str, str]]:
     """Every reason to doubt a pair that is not rejected."""
-    limit = _error_limit(options, fixed_size)
+    limit = error_limit(options, fixed_size)
     found = []
     if evidence.log10_false_alarms > options.sure_log10_false_alarms and evidence.agreement.share < 0.6:
         found.append((f"{_agree(evidence)}, few for a verdict, and {_blocks(evidence)}", "look at the overlay"))
@@ -323,7 +323,7 @@ def judge_typed(
     there, _ = project(transform, pairs.src)
     error = _root_mean_square(np.linalg.norm(there - pairs.dst, axis=1))
     anisotropy = _shape(transform, overlap_points(transform, sizes.moving, sizes.fixed))[1]
-    limit = _error_limit(options, sizes.fixed)
+    limit = error_limit(options, sizes.fixed)
     if not np.isfinite(anisotropy):
         return unfit_points(
             f"the {len(pairs)} typed points give a transform that folds or mirrors the picture, or misses it"
