@@ -120,7 +120,7 @@ def with_cells(options: Any, cells: Mapping[str, str]) -> Any:
     return replace(options, **changes)
 
 
-def _option_types(kind: type) -> dict[str, Any]:
+def _option_types(kind: Any) -> dict[str, Any]:
     """Name to type of all fields of a dataclass and of those inside it."""
     found: dict[str, Any] = {}
     for name, hint in get_type_hints(kind).items():

@@ -53,7 +53,7 @@ def align_task(task: Task) -> Done:
 
 
 def failed_row(job: Job, reason: str) -> Row:
-    """The row of a job that could not be tried, or not be finished; nothing of an earlier run may pass for its result."""
+    """The row of a job that could not be tried or finished; nothing of an earlier run may pass for its result."""
     for path in (job.output, job.sidecar, job.recording):
         path.unlink(missing_ok=True)
     return Row(name=job.name, fixed=job.fixed, moving=job.moving, status="failed", reason=reason)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import cv2
@@ -57,17 +58,16 @@ def _read(path: Path) -> Features | None:
 
 def _kept(path: Path, found: Features) -> Features:
     data = io.BytesIO()
-    np.savez(data, **{field.name: np.asarray(getattr(found, field.name)) for field in fields(found)})
-    try:
+    arrays: dict[str, Any] = {field.name: np.asarray(getattr(found, field.name)) for field in fields(found)}
+    np.savez(data, **arrays)
+    with suppress(ImageWriteError):
         write_bytes_atomically(path, data.getvalue(), overwrite=True)
-    except ImageWriteError:
-        pass
     return found
 
 
 @contextmanager
 def _claimed(path: Path) -> Iterator[None]:
-    """Nobody else is in here for the same path meanwhile; without file locks (Windows, some networks) all are let in."""
+    """Nobody else is in here for the same path meanwhile; all are let in where there are no file locks (Windows)."""
     try:
         import fcntl
 
