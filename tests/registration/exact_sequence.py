@@ -1,4 +1,4 @@
-"""Time-lapses whose transforms are known exactly: views of one scene that drift over it and shake, under passing light."""
+"""Time-lapses whose transforms are known exactly: views that drift over a scene and shake, under passing light."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ Graduated non-convexity, 2020; the variance of unit weight is that of geodetic n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +60,7 @@ class Adjustment:
     norm: Array  # (n, 3, 3)
     kept: Mask  # (m,) False: overruled by the others
     misfit: Array  # (m,) in standard deviations, 1 on the average where the ties are as good as they claim
-    unit_sigma: float  # how many times larger than claimed the errors of the ties are; not under 1
+    unit_sigma: float  # how many times larger than claimed the errors of the ties are, as their misfits show
 
     def known(self, frame: int) -> Uncertainty:
         """The uncertainty of `reference_from_frame[frame]`, for the functions that take it to points."""
@@ -91,6 +92,26 @@ def _untied(model: Model, norm: Array) -> Adjustment:
         misfit=nothing,
         unit_sigma=1.0,
     )
+
+
+def adjust_in_simplest(
+    models: Sequence[Model], reference: int, norm: Array, ties: Ties, *, threshold: float = 3.0
+) -> tuple[Model, Adjustment]:
+    """The simplest of the models, given from simple to general, in which the ties agree as in the most general one.
+
+    That is the one of least BIC (Schwarz 1978), with the scale of the errors that the most general one shows, among
+    those that overrule no tie that it does not. A model of few parameters leaves less room for the errors of the ties.
+    """
+    general = adjust(models[-1], reference, norm, ties, threshold=threshold)
+    best, chosen = np.inf, (models[-1], general)
+    for model in models:
+        adjusted = general if model is models[-1] else adjust(model, reference, norm, ties, threshold=threshold)
+        if (adjusted.kept | ~general.kept).all():
+            squared = 8.0 * (adjusted.misfit[general.kept] / max(general.unit_sigma, 1e-6)) ** 2
+            criterion = squared.sum() + model.degrees_of_freedom * len(norm) * np.log(max(8 * len(squared), 1))
+            if criterion < best:
+                best, chosen = criterion, (model, adjusted)
+    return chosen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,7 +211,7 @@ def _graduated(network: _Network, transforms: Array, threshold: float, max_steps
     width = np.inf
     for _ in range(max_steps):
         at = _linearise(network, transforms)
-        limit = 8.0 * threshold**2 * _unit_variance(network, at.squared, len(everyone))
+        limit = _limit(threshold, _unit_variance(network, at.squared, len(everyone)))
         width = min(width / _NARROWING, _WIDEST, 2.0 * float(at.squared.max()) / limit)
         scale = max(width, 1.0) * limit
         transforms, moved = _moved(network, transforms, at, (scale / (scale + at.squared)) ** 2, everyone)
@@ -205,7 +226,7 @@ def _settled(network: _Network, transforms: Array, threshold: float, max_steps: 
     for _ in range(max_steps):
         at = _linearise(network, transforms)
         unit_variance = _unit_variance(network, at.squared[kept], len(network.held(kept)))
-        before, kept = kept, at.squared <= 8.0 * threshold**2 * unit_variance
+        before, kept = kept, at.squared <= _limit(threshold, unit_variance)
         held = network.held(kept)
         transforms, moved = _moved(network, transforms, at, kept.astype(np.float64), held)
         if moved < 1e-9 and (kept == before).all():
@@ -214,7 +235,7 @@ def _settled(network: _Network, transforms: Array, threshold: float, max_steps: 
     transforms[loose] = unit(IDENTITY)
     return Adjustment(
         reference_from_frame=transforms,
-        covariance=unit_variance * _covariance(network, at, kept, held),
+        covariance=max(unit_variance, 1.0) * _covariance(network, at, kept, held),
         norm=network.norm,
         kept=kept,
         misfit=np.sqrt(at.squared / 8.0),
@@ -223,11 +244,16 @@ def _settled(network: _Network, transforms: Array, threshold: float, max_steps: 
 
 
 def _unit_variance(network: _Network, squared: Array, held: int) -> float:
-    """Variance of a misfit that claims to be 1, from the median square; least squares hides a part of it."""
+    """Variance of misfits that claim to be 1, from their median square; least squares hides a part of it."""
     shown = 8 * len(squared) - network.model.degrees_of_freedom * held
     if shown <= 0:
         return 1.0
-    return max(float(np.median(squared)) / _MEDIAN_SQUARE * 8 * len(squared) / shown, 1.0)
+    return float(np.median(squared)) / _MEDIAN_SQUARE * 8 * len(squared) / shown
+
+
+def _limit(threshold: float, unit_variance: float) -> float:
+    """The squared misfit from which a tie is overruled; ties that agree better than they claim are not held to it."""
+    return 8.0 * threshold**2 * max(unit_variance, 1.0)
 
 
 def _moved(network: _Network, transforms: Array, at: _Linearised, weights: Array, held: Indices) -> tuple[Array, float]:

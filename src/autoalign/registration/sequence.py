@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from autoalign.geometry.family import MODEL_NAMES, MODELS, ModelName
+from autoalign.geometry.family import MODEL_NAMES, MODELS, Model, ModelName
 from autoalign.geometry.graph import Indices, cheapest_tree, groups, hanging_in_dispute
 from autoalign.geometry.homography import IDENTITY, Array, Mask, normalisation, shown
 from autoalign.geometry.least_squares import polish
-from autoalign.geometry.network import Adjustment, Ties, adjust
+from autoalign.geometry.network import Adjustment, Ties, adjust_in_simplest
 from autoalign.geometry.uncertainty import overlap_points, point_errors, uncertainty
 from autoalign.registration.alignment import Alignment
 from autoalign.registration.verdict import Status, VerdictOptions, error_limit
@@ -121,7 +121,7 @@ def solve_sequence(
 ) -> tuple[SequenceFrame, ...]:
     """Every frame's transform onto the reference, from the links between them, whose order does not matter.
 
-    `sizes` are (w, h) of the n frames. The frames move in the simplest model that holds those of all links. Aligned are
+    `sizes` are (w, h) of the n frames. The frames move in the simplest model that all links agree on. Aligned are
     frames that aligned links hold to the reference; those that hang on a doubtful link are doubtful, and so are those
     that hang on one link alone where another contradicts it. Raises ValueError for frames that are not there.
     """
@@ -132,8 +132,9 @@ def solve_sequence(
     if any(not 0 <= frame < n for link in links for frame in (link.fixed, link.moving)):
         raise ValueError(f"a link names a frame that is not among the {n}")
     chosen = _needed(n, sorted(links, key=lambda link: (link.fixed, link.moving)))
-    model = _common_model(chosen)
-    adjusted = adjust(MODELS[model], reference, _norms(sizes), _ties(chosen), threshold=options.threshold)
+    model, adjusted = adjust_in_simplest(
+        _models(chosen), reference, _norms(sizes), _ties(chosen), threshold=options.threshold
+    )
     standing = _standing(n, reference, chosen, adjusted)
     tried = Counter(frame for link in links for frame in (link.fixed, link.moving))
     return tuple(
@@ -154,10 +155,10 @@ def _needed(n: int, links: Sequence[Link]) -> list[Link]:
     return aligned + [link for link in links if link.status == "doubtful" and group[link.fixed] != group[link.moving]]
 
 
-def _common_model(links: Sequence[Link]) -> ModelName:
-    """The simplest model that holds those of all links."""
-    found = {link.model for link in links}
-    return next((name for name in reversed(MODEL_NAMES) if name in found), "translation")
+def _models(links: Sequence[Link]) -> list[Model]:
+    """Those of the links, and those between them, from simple to general."""
+    found = sorted(MODEL_NAMES.index(link.model) for link in links if link.model) or [MODEL_NAMES.index("translation")]
+    return [MODELS[name] for name in MODEL_NAMES[found[0] : found[-1] + 1]]
 
 
 def _ends(links: Sequence[Link]) -> tuple[Indices, Indices]:
@@ -221,7 +222,7 @@ def _of_frames(n: int, links: Sequence[Link]) -> list[list[tuple[int, int]]]:
 def _frame(
     frame: int,
     tried: int,
-    model: ModelName,
+    model: Model,
     adjusted: Adjustment,
     standing: _Standing,
     sizes: tuple[tuple[int, int], tuple[int, int]],
@@ -230,13 +231,13 @@ def _frame(
     """The verdict on one frame; `sizes` are its own and the reference's."""
     transform, (own_size, reference_size) = adjusted.reference_from_frame[frame], sizes
     everywhere = overlap_points(IDENTITY, own_size, own_size)
-    error_px = float(point_errors(MODELS[model], transform, adjusted.known(frame), everywhere).mean())
+    error_px = float(point_errors(model, transform, adjusted.known(frame), everywhere).mean())
     status, reason = _verdict(frame, tried, standing, error_px, error_limit(options, reference_size))
     rejected = status == "rejected"
     return SequenceFrame(
         status=status,
         reason=reason,
-        model=model,
+        model=model.name,
         reference_from_frame=None if rejected else shown(transform),
         expected_error_px=None if rejected else error_px,
         used=tuple(standing.used[frame]),
