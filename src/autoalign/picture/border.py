@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 
-from autoalign.picture.pixels import Picture, full_scale, has_alpha
+from autoalign.picture.pixels import Picture, PixelSource, full_scale, has_alpha
 from autoalign.picture.warp import Warped
 
 Border = Literal["transparent", "constant", "replicate"]
@@ -31,7 +31,7 @@ def bordered(warped: Warped, border: Border) -> Picture:
     return _replicated(warped) if border == "replicate" else warped.pixels
 
 
-def like_bordered(pixels: Picture, border: Border) -> Picture:
+def like_bordered(pixels: PixelSource, border: Border) -> Picture:
     """A picture of the size, dtype and channels that `bordered` gives to one like `pixels`; it takes no memory."""
     channels = pixels.shape[2:]
     if border == "transparent" and not has_alpha(pixels):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autoalign.geometry.homography import invert, project, translation
-from autoalign.picture.pixels import Picture, check_picture, full_scale, has_alpha, size_of
+from autoalign.picture.pixels import Picture, PixelSource, check_source, full_scale, has_alpha, size_of
 
 Interpolation = Literal["linear", "nearest"]
 
@@ -67,7 +67,7 @@ class _Box:
 
 
 def warp(
-    image: Picture,
+    image: PixelSource,
     size: tuple[int, int],
     dst_from_src: NDArray[np.float64],
     *,
@@ -83,29 +83,32 @@ def warp(
     channel, is painted where there is no data and never mixed into what is valid. A source crossed by the horizon is
     drawn only on that side of it where `anchor` (x, y) lies, by default the picture's centre.
 
+    `image` is an array, or what is read where it is asked for: each tile of the output asks once, for what it needs.
     Output is made in tiles of at most `tile_px` a side, each from the part of the source it needs and in coordinates of
     its own: no limit on the sides of either picture, and the place of a sample is good to about 1e-4 px.
 
     Raises ValueError for what is no picture, a size without pixels, a singular transform, a fill that does not fit.
     """
-    check_picture(image)
+    check_source(image)
     if interpolation not in ("linear", "nearest"):
         raise ValueError(f'interpolation must be "linear" or "nearest", not {interpolation!r}')
     if tile_px < 1:
         raise ValueError(f"tile_px must be at least 1, not {tile_px}")
     paint = _fill_values(fill, image)
-    source = image[..., 0] if image.shape[2:] == (1,) else image  # cv2 drops a lone channel; it comes back at the end
-    src_from_dst = _src_from_dst(size_of(source), dst_from_src, anchor)
+    src_size, channels = size_of(image), image.shape[2:]
+    src_from_dst = _src_from_dst(src_size, dst_from_src, anchor)
     nearest = interpolation == "nearest" or _takes_pixels_onto_pixels(src_from_dst, size)
-    resample = _nearest if nearest else _bilinear_under_alpha if has_alpha(source) else _bilinear
+    resample = _nearest if nearest else _bilinear_under_alpha if has_alpha(image) else _bilinear
 
-    starts, stops = _runs(size_of(source), size, src_from_dst)
-    pixels = np.empty((size[1], size[0], *source.shape[2:]), source.dtype)
-    for tile, read in _tiles(size_of(source), size, src_from_dst, starts, stops, tile_px):
+    starts, stops = _runs(src_size, size, src_from_dst)
+    # cv2 drops a lone channel; it comes back at the end.
+    pixels = np.empty((size[1], size[0], *(() if channels == (1,) else channels)), image.dtype)
+    for tile, read in _tiles(src_size, size, src_from_dst, starts, stops, tile_px):
         read_from_tile = translation(-read.x0, -read.y0) @ src_from_dst @ translation(tile.x0, tile.y0)
-        resample(source[read.slices], pixels[tile.slices], read_from_tile)
+        part = image[read.slices]
+        resample(part.reshape(part.shape[:2] + pixels.shape[2:]), pixels[tile.slices], read_from_tile)
 
-    pixels = pixels.reshape(*pixels.shape[:2], *image.shape[2:])
+    pixels = pixels.reshape(*pixels.shape[:2], *channels)
     _paint_outside(pixels, starts, stops, paint)
     return Warped(pixels=pixels, valid=_mask(starts, stops, size))
 
@@ -193,7 +196,7 @@ def _paint_outside(pixels: Picture, starts: NDArray[np.intp], stops: NDArray[np.
         row[stop:] = paint
 
 
-def _fill_values(fill: float | Sequence[float], image: Picture) -> Picture:
+def _fill_values(fill: float | Sequence[float], image: PixelSource) -> Picture:
     """The fill as () or (c,) in the picture's dtype."""
     wanted = np.asarray(fill, np.float64)
     if wanted.shape not in ((), image.shape[2:]):
