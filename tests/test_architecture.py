@@ -72,7 +72,20 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
         )
     },
     {"views": ("words", "evidence", "pictures", "viewer", "window")},
-    {"batch": ("jobs", "sources", "manifest", "memory", "work", "slot", "engine")},
+    {
+        "batch": (
+            "jobs",
+            "sources",
+            "manifest",
+            "memory",
+            "work",
+            "slot",
+            "engine",
+            "ledger",
+            "run",
+            "chain",
+        )
+    },
     {"cli": ("terminal", "settings", "files", "view", "pair", "rectify", "apply", "main")},
 )
 
