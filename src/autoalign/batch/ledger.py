@@ -44,8 +44,7 @@ HASHING_S = 1.0  # at most so much hashing is lost by a crash
 
 # File systems whose locks and shared memory are those of one machine, as a write-ahead log needs them.
 LOCAL_FILE_SYSTEMS = frozenset(
-    ("apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "jfs", "ntfs", "overlay", "ramfs", "tmpfs")
-    + ("ufs", "xfs", "zfs")
+    ("apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "ntfs", "overlay", "tmpfs", "xfs", "zfs")
 )
 
 State = RowStatus | Literal["pending"]
@@ -96,10 +95,8 @@ class LedgerReader:
 
     def counts(self) -> dict[State, int]:
         """How many jobs there are in each state, zeros included."""
-        found = self._found(
-            "SELECT coalesce(status, 'pending'), count(*) FROM job LEFT JOIN result USING (key) GROUP BY 1"
-        )
-        return dict.fromkeys(STATES, 0) | dict(found)
+        sql = "SELECT coalesce(status, 'pending'), count(*) FROM job LEFT JOIN result USING (key) GROUP BY 1"
+        return dict.fromkeys(STATES, 0) | dict(self._found(sql))
 
     def pending(self) -> list[str]:
         """The keys of what is to be done, in the order of the plan."""
