@@ -10,16 +10,16 @@ import logging
 import struct
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import tifffile
 
 from autoalign.files import exif, microscope
-from autoalign.files.codec import Decoder, Encoder, Header, Refused
+from autoalign.files.codec import Decoder, Encoder, Header, Refused, full_range
 from autoalign.files.georeference import NO_DATA, georeference_of
 from autoalign.files.metadata import Metadata, resolution
-from autoalign.picture.pixels import DTYPES, Picture, has_alpha, size_of
+from autoalign.picture.pixels import DTYPES, Picture, PixelSource, has_alpha, size_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -58,12 +58,12 @@ def encoder() -> Encoder:
 
 def _read_header(data: bytes, number: int) -> Header:
     with _page(data, number) as page:
-        _check_readable(page)
+        check_readable(page)
         orientation = _tag(page, "Orientation", 1)
         return Header(
             size=(page.imagewidth, page.imagelength),
             orientation=orientation if orientation in range(1, 9) else 1,
-            metadata=_read_metadata(data, page, number),
+            metadata=read_metadata(data, page, number),
         )
 
 
@@ -75,31 +75,49 @@ def _decode(data: bytes, number: int) -> Picture:
             raise ValueError(f"the pixels have shape {stored.shape}, the header says {page.shaped}")
         # (planes, depth, h, w, samples): either the planes or the samples are the channels.
         pixels = stored[0, 0] if len(stored) == 1 else np.concatenate(stored[:, 0], axis=-1)
-        return _straight(_levels(pixels[..., 0] if pixels.shape[2] == 1 else pixels, page), page)
+        return as_picture(pixels, page)
 
 
 def _encode(pixels: Picture, metadata: Metadata) -> bytes:
     stream = io.BytesIO()
-    directory = exif.described(exif.directory_of(metadata.exif))
-    # The byte order of the camera: maker notes keep theirs.
-    layout = exif.Layout(order=_order(metadata.exif), big=pixels.nbytes > MAX_CLASSIC)
+    layout = layout_for(metadata, big=pixels.nbytes > MAX_CLASSIC)
     with tifffile.TiffWriter(stream, bigtiff=layout.big, byteorder=layout.order) as file:
-        file.write(
-            pixels,
-            photometric="minisblack" if pixels.ndim == 2 or pixels.shape[2] < 3 else "rgb",
-            planarconfig="contig" if pixels.ndim == 3 else None,
-            extrasamples=["unassalpha"] if has_alpha(pixels) else None,
-            compression="zlib",
-            predictor=True,
-            **_resolution(metadata),
-            iccprofile=metadata.icc,
-            extratags=_extra_tags(metadata, directory, size_of(pixels), layout),
-            # Neither a description nor the name of the library: the bytes depend on the picture alone.
-            metadata=None,
-            software=False,
-        )
-    _append_directories(stream, directory, layout)
+        file.write(pixels, **how_stored(pixels), **tags_of(metadata, size_of(pixels), layout))
+    append_directories(stream, metadata, layout)
     return stream.getvalue()
+
+
+def layout_for(metadata: Metadata, *, big: bool) -> exif.Layout:
+    """The byte order of the camera, because maker notes keep theirs."""
+    return exif.Layout(order=_order(metadata.exif), big=big)
+
+
+def how_stored(like: PixelSource) -> dict[str, Any]:
+    """What the writer is to be told of pixels like these, (h, w) or (h, w, c)."""
+    return {
+        "photometric": "minisblack" if (*like.shape, 1)[2] < 3 else "rgb",
+        "planarconfig": "contig" if len(like.shape) == 3 else None,
+        "extrasamples": ["unassalpha"] if has_alpha(like) else None,
+        "compression": "zlib",
+        "predictor": True,
+        # Neither a description nor the name of the library: the bytes depend on the picture alone.
+        "metadata": None,
+        "software": False,
+    }
+
+
+def tags_of(metadata: Metadata, size: tuple[int, int], layout: exif.Layout) -> dict[str, Any]:
+    """What the writer is to be told of a picture of `size` (w, h) beside its pixels."""
+    return {
+        **_resolution(metadata),
+        "iccprofile": metadata.icc,
+        "extratags": _extra_tags(metadata, _directory(metadata), size, layout),
+    }
+
+
+def _directory(metadata: Metadata) -> exif.Directory:
+    """The EXIF block as a part of the page's own directory."""
+    return exif.described(exif.directory_of(metadata.exif))
 
 
 @contextmanager
@@ -120,7 +138,12 @@ def _tag(page: Any, name: str, default: Any) -> Any:
     return page.tags[name].value if name in page.tags else default
 
 
-def _check_readable(page: Any) -> None:
+def as_picture(stored: Picture, page: Any) -> Picture:
+    """Numbers (h, w, samples) as a page stores them, all or some of its rows and columns, as (h, w) or (h, w, c)."""
+    return _straight(_levels(stored[..., 0] if stored.shape[2] == 1 else stored, page), page)
+
+
+def check_readable(page: Any) -> None:
     """Raise Refused, with the reason, unless the pixels can become a picture."""
     kind = page.photometric
     if kind not in COLOURS or (kind == PHOTOMETRIC.YCBCR and page.compression != JPEG_COMPRESSION):
@@ -145,8 +168,8 @@ def _levels(pixels: Picture, page: Any) -> Picture:
     if page.photometric == PHOTOMETRIC.PALETTE:
         palette = (page.colormap >> 8).astype(np.uint8).T  # 16 bits by the standard
         return np.asarray(palette[pixels])
-    if page.bitspersample < 8:
-        pixels = pixels.astype(np.uint8) * np.uint8(255 // (2**page.bitspersample - 1))
+    if pixels.dtype != np.float32:
+        pixels = full_range(pixels.astype(np.uint8) if pixels.dtype == np.bool_ else pixels, page.bitspersample)
     if page.photometric != PHOTOMETRIC.MINISWHITE:
         return pixels
     white = 1.0 if pixels.dtype == np.float32 else np.iinfo(pixels.dtype).max
@@ -168,7 +191,7 @@ def _straight(pixels: Picture, page: Any) -> Picture:
     return np.concatenate([colours.astype(pixels.dtype), pixels[..., -1:]], axis=-1)
 
 
-def _read_metadata(data: bytes, page: Any, number: int) -> Metadata:
+def read_metadata(data: bytes, page: Any, number: int) -> Metadata:
     layout = exif.Layout(order=page.parent.byteorder, big=page.parent.is_bigtiff)
     directory = dict(exif.read_directory(data, page.offset, layout))
     # A microscope describes all pictures of a file in the first one; other programs each its own.
@@ -224,9 +247,10 @@ def _extra_tags(
     ]
 
 
-def _append_directories(stream: io.BytesIO, directory: exif.Directory, layout: exif.Layout) -> None:
+def append_directories(stream: IO[bytes], metadata: Metadata, layout: exif.Layout) -> None:
     """Put the directories that a page points to at the end of the file, and where they are into their places."""
-    inner = {code: item for code, item in directory.items() if code in PLACEHOLDERS and not isinstance(item, exif.Tag)}
+    found = _directory(metadata)
+    inner = {code: item for code, item in found.items() if code in PLACEHOLDERS and not isinstance(item, exif.Tag)}
     if not inner:
         return
     places, _ = exif.entry_places(stream.getvalue(), 8 if layout.big else 4, layout)
