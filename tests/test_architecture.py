@@ -71,7 +71,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "row",
         )
     },
-    {"views": ("words", "evidence", "pictures", "viewer", "window")},
+    {"views": ("motion", "words", "evidence", "pictures", "charts", "report", "viewer", "window")},
     {
         "batch": (
             "jobs",

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from autoalign.errors import ImageWriteError
 from autoalign.files.codec import one_line
@@ -12,6 +15,7 @@ from autoalign.files.formats import FORMATS, PNG, TIFF, Format, encoder_for, of_
 from autoalign.files.metadata import Metadata, describing
 from autoalign.picture.pixels import Picture, check_picture, has_alpha, size_of
 
+TEMPORARY = ".autoalign-{}.tmp"  # name of a file that is being written
 NEW_FILE_MODE = 0o666  # less what the umask takes, as for every file that a program makes
 
 
@@ -49,15 +53,33 @@ def write_bytes_atomically(path: str | Path, data: bytes, overwrite: bool = Fals
 
     Raises ImageWriteError, the path last, if the file exists and `overwrite` is not set, or it cannot be written.
     """
+    with writing_atomically(path, overwrite) as write:
+        write(data)
+
+
+@contextmanager
+def writing_atomically(path: str | Path, overwrite: bool = False) -> Iterator[Callable[[bytes], None]]:
+    """What appends bytes to a file that is at `path`, whole, once the block has ended well; else nothing is left behind.
+
+    Raises ImageWriteError, the path last, as `write_bytes_atomically` does.
+    """
     path = Path(path)
     check_writable(path, overwrite)
     # Beside the file, because a rename is atomic only within one file system; a short name, because long ones may fail.
-    temporary = path.with_name(f".autoalign-{secrets.token_hex(8)}.tmp")
+    temporary = path.with_name(TEMPORARY.format(secrets.token_hex(8)))
     try:
-        _write_through(temporary, data)
-        os.replace(temporary, path)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        raise ImageWriteError(f"cannot be written ({one_line(error)}): {path}") from error
+        with _new_file(temporary, path) as file:
+
+            def write(data: bytes) -> None:
+                with _blaming(path):
+                    file.write(data)
+
+            yield write
+            with _blaming(path):
+                file.flush()
+                os.fsync(file.fileno())
+        with _blaming(path):
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -114,13 +136,26 @@ def default_output(moving_path: str | Path, pixels: Picture | None = None) -> Pa
     return path.with_name(f"{path.stem}_aligned{extension}")
 
 
-def _write_through(path: Path, data: bytes) -> None:
-    """A new file with these bytes, on the disk when this returns."""
+@contextmanager
+def _new_file(temporary: Path, path: Path) -> Iterator[BinaryIO]:
+    """A file that was not there before; whatever goes wrong with it is said of `path`."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)  # the last one on Windows only
-    with open(os.open(path, flags, NEW_FILE_MODE), "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    with _blaming(path):
+        file = open(os.open(temporary, flags, NEW_FILE_MODE), "wb")
+    try:
+        yield file
+    finally:
+        with _blaming(path):  # closing writes too, once more where it failed before
+            file.close()
+
+
+@contextmanager
+def _blaming(path: Path) -> Iterator[None]:
+    """Turns what an operating system raises into the error that names this file."""
+    try:
+        yield
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise ImageWriteError(f"cannot be written ({one_line(error)}): {path}") from error
 
 
 def _extensions() -> str:

@@ -7,20 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from autoalign.files.row import RowStatus
 from autoalign.geometry.chance import first_in_each_cell
 from autoalign.geometry.homography import Array, project
 from autoalign.registration.alignment import Alignment, Attempt
-from autoalign.registration.verdict import Status
 
 Colours = NDArray[np.uint8]  # (n, 3)
 
 LINES = 120  # more cannot be told apart
 REJECTED_LINES = 40  # of matches that do not agree, where others do
 BINS = 40
-STATUS_COLOUR: dict[Status, tuple[int, int, int]] = {
+STATUS_COLOUR: dict[RowStatus, tuple[int, int, int]] = {
     "aligned": (63, 201, 107),
     "doubtful": (245, 180, 40),
     "rejected": (240, 70, 60),
+    "failed": (167, 139, 230),
 }
 _GREEN_TO_RED = np.array([(63, 201, 107), (235, 215, 50), (240, 70, 60)], np.float64)
 _GREEN_TO_ORANGE = np.array([(63, 201, 107), (215, 220, 60), (255, 150, 30)], np.float64)  # red is for what is rejected

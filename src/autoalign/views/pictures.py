@@ -68,6 +68,10 @@ class _Both:
     moving: _Pixels  # (h, w, 3), black where it has no data
     valid: NDArray[np.bool_]  # (h, w) where the moving one has data
 
+    def in_context(self, drawn: _Pixels) -> _Pixels:
+        """What is drawn where the moving one has data; elsewhere the fixed one, dark."""
+        return np.where(self.valid[..., None], drawn, self.fixed // 3)
+
 
 def original_bytes(loaded: LoadedPicture) -> bytes | None:
     """The file's bytes, if they still are those that were read."""
@@ -110,7 +114,7 @@ def layers(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> Layers 
         fixed=None if size_of(a) == size_of(fixed) and fixed.dtype == np.uint8 else _encoded(a),
         moving=_encoded(np.where(valid[..., None], b, a)),
         checkerboard=_encoded(drawn("checkerboard", _tinted(b))),
-        green_magenta=_encoded(np.where(valid[..., None], drawn("red-cyan")[..., [1, 0, 1]], a // 3)),
+        green_magenta=_encoded(both.in_context(drawn("red-cyan")[..., [1, 0, 1]])),
         difference=_encoded(drawn("difference")),
     )
 
@@ -118,9 +122,10 @@ def layers(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> Layers 
 def thumbnails(fixed: Picture, moving: Picture, fixed_from_moving: Array | None) -> Thumbnails:
     """Both pictures small, and the moving one as a transform (3, 3) lays it, whatever the verdict on that.
 
-    Before, the moving picture stands whole in the middle of the fixed one's frame, its sides in proportion. Black is
-    where it has no data. The same fixed picture gives the same bytes beside any other. Without a transform, or with one
-    that has no inverse, `after` is None. Pictures are (h, w) or (h, w, 1..4), of any depth that autoalign reads.
+    Before, the moving picture stands whole in the middle of the fixed one's frame, its sides in proportion; after,
+    where it has no data, the fixed one shows dark, so that one sees how it goes on. The same fixed picture gives the
+    same bytes beside any other. Without a transform, or with one that has no inverse, `after` is None. Pictures are
+    (h, w) or (h, w, 1..4), of any depth that autoalign reads.
     """
     w, h = size_of(fixed)
     small = shrink(fixed, min(1.0, THUMBNAIL_SIDE / max(w, h)) ** 2 * w * h)
@@ -133,7 +138,7 @@ def thumbnails(fixed: Picture, moving: Picture, fixed_from_moving: Array | None)
     return Thumbnails(
         fixed=_encoded(before.fixed, THUMBNAIL_QUALITY).data,
         before=_encoded(before.moving, THUMBNAIL_QUALITY).data,
-        after=None if after is None else _encoded(after.moving, THUMBNAIL_QUALITY).data,
+        after=None if after is None else _encoded(after.in_context(after.moving), THUMBNAIL_QUALITY).data,
     )
 
 

@@ -8,15 +8,15 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
-
+from autoalign.files.row import RowStatus
 from autoalign.geometry.family import MODELS
-from autoalign.geometry.homography import Array, jacobian, shown
+from autoalign.geometry.homography import Array, shown
 from autoalign.registration.alignment import Alignment, Attempt
 from autoalign.registration.verdict import Evidence, Sizes, Status, VerdictOptions, expected_error, judge
+from autoalign.views.motion import Motion, motion
 
-Mark = Literal["✓", "⚠", "✗"]
-MARK_OF: dict[Status, Mark] = {"aligned": "✓", "doubtful": "⚠", "rejected": "✗"}
+Mark = Literal["✓", "⚠", "✗", "!"]
+MARK_OF: dict[RowStatus, Mark] = {"aligned": "✓", "doubtful": "⚠", "rejected": "✗", "failed": "!"}
 
 # Options under which any evidence passes: with one group of the real ones put back, `judge` tells what that group says.
 _LENIENT = VerdictOptions(
@@ -182,6 +182,12 @@ def number(value: float) -> str:
     return "∞" if math.isinf(value) else f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
+def moved(by: Motion) -> str:
+    """What a transform does, but for the shift."""
+    mirrored = "mirrored, " if by.mirrored else ""
+    return f"{mirrored}turned by {math.degrees(by.turn_rad):.1f}°, {number(by.scale)} times as large"
+
+
 def power(log10: float) -> str:
     """A probability by its logarithm; one that is not below 1 is no surprise."""
     return f"10^{log10:.0f}" if log10 < 0 else "1 (certain)"
@@ -219,7 +225,7 @@ def _transform(alignment: Alignment) -> str:
         )
     refused = "## The transform that was refused" if alignment.status == "rejected" else "## Moving → fixed"
     rows = [[f"{value:.6g}" for value in row] for row in _of_any_scale(transform)]
-    words = _motion(transform, alignment.moving_size)
+    words = moved(motion(transform, alignment.moving_size))
     return f"{refused}\n\n{alignment.model}: {words}\n\n{table(('x', 'y', '1'), rows)}"
 
 
@@ -228,16 +234,6 @@ def _of_any_scale(transform: Array) -> Array:
         return shown(transform)
     except ValueError:  # the origin lies at infinity: shown as it is
         return transform
-
-
-def _motion(transform: Array, moving_size: tuple[int, int]) -> str:
-    """What the transform does at the middle of the moving picture."""
-    middle = (np.array([moving_size], np.float64) - 1) / 2
-    slope = jacobian(transform, middle)[0]
-    turn = math.degrees(math.atan2(slope[1, 0] - slope[0, 1], slope[0, 0] + slope[1, 1]))
-    scale = math.sqrt(abs(float(np.linalg.det(slope))))
-    mirrored = "mirrored, " if np.linalg.det(slope) < 0 else ""
-    return f"{mirrored}turned by {turn:.1f}°, {number(scale)} times as large"
 
 
 def _stages(alignment: Alignment) -> str:
