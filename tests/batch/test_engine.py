@@ -1,8 +1,7 @@
-"""Jobs that die in every way there is: each is one casualty with its cause, and its neighbours know nothing of it."""
+"""The engines on this machine, with jobs that die in every way there is."""
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import os
 import signal
@@ -10,65 +9,19 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 
-import cv2
+import doomed
 import psutil
 import pytest
-import threadpoolctl
 
 from autoalign.batch.engine import Engine, InlineEngine, LocalEngine, cores, stream
-from autoalign.batch.slot import Casualty, Limits, Outcome, Slot, Terms
+from autoalign.batch.slot import Limits, Outcome
 from autoalign.errors import EngineError
 
-MB = 1_000_000
-
-
-def square(number: int) -> int:
-    return number * number
-
-
-def fall(how: str) -> str:
-    """A job that meets its end as it is told."""
-    if how == "segfault":
-        ctypes.string_at(0)
-    elif how == "killed":
-        os.kill(os.getpid(), signal.SIGKILL)
-    elif how == "exit":
-        os._exit(7)
-    elif how == "hang":
-        time.sleep(1000)
-    elif how == "hog":
-        _hog()
-    elif how == "no memory":
-        raise MemoryError
-    elif how == "error":
-        raise ValueError("no\nsuch thing")
-    elif how == "sys.exit":
-        sys.exit("bye")
-    elif how == "unpicklable":
-        return lambda: None  # type: ignore[return-value]
-    return f"survived {how}"
-
-
-def _hog() -> None:
-    held = []
-    while True:  # bytes are written to, so that they are resident
-        held.append(b"x" * (10 * MB))
-
-
-ENDS = {
-    "segfault": ("crashed", "the worker was killed by signal 11 (segmentation fault)"),
-    "killed": ("crashed", "the worker was killed by signal 9 (killed), by hand or by a system short of memory"),
-    "exit": ("crashed", "the worker ended with exit code 7"),
-    "hang": ("timeout", "took more than 2 s"),
-    "hog": ("memory", "needed more than 0.4 GB"),
-    "no memory": ("memory", "needed more memory than there is"),
-    "error": ("error", "ValueError: no such thing"),
-    "sys.exit": ("error", "SystemExit: bye"),
-}
+LIMITS = Limits(time_s=2, memory=400 * doomed.MB)
 
 
 def by_job(outcomes: Iterator[Outcome[str, str]]) -> dict[str, Outcome[str, str]]:
@@ -76,21 +29,190 @@ def by_job(outcomes: Iterator[Outcome[str, str]]) -> dict[str, Outcome[str, str]
 
 
 def test_every_end_is_one_casualty_and_the_neighbours_survive() -> None:
-    engine = LocalEngine(workers=2, limits=Limits(time_s=2, memory=400 * MB))
     innocents = [f"innocent {number}" for number in range(20)]
-    jobs = [job for pair in zip(innocents, ENDS, strict=False) for job in pair] + innocents[len(ENDS) :]
+    jobs = [job for pair in zip(innocents, doomed.ENDS, strict=False) for job in pair] + innocents[len(doomed.ENDS) :]
 
-    outcomes = by_job(engine.run(fall, jobs))
+    outcomes = by_job(LocalEngine(workers=2, limits=LIMITS).run(doomed.fall, jobs))
 
     assert sorted(outcomes) == sorted(jobs)
     for job in innocents:
-        assert outcomes[job].result == f"survived {job}"
-        assert outcomes[job].casualty is None
-    for job, (cause, reason) in ENDS.items():
+        assert (outcomes[job].result, outcomes[job].casualty) == (f"survived {job}", None)
+    for job, (cause, reason) in doomed.ENDS.items():
         casualty = outcomes[job].casualty
-        assert outcomes[job].result is None
         assert casualty is not None
-        assert (casualty.cause, casualty.reason) == (cause, reason)
+        assert (outcomes[job].result, casualty.cause, casualty.reason) == (None, cause, reason)
     assert 2 <= outcomes["hang"].seconds < 5
 
 
+def test_a_result_that_cannot_be_sent_is_an_error_with_its_trace() -> None:
+    (outcome,) = LocalEngine(workers=1).run(doomed.fall, ["unpicklable"])
+
+    assert outcome.casualty is not None
+    assert outcome.casualty.cause == "error"
+    assert "pickle" in outcome.casualty.reason
+    assert "Traceback" in outcome.casualty.trace
+
+
+def test_messages_larger_than_a_pipe_go_through() -> None:
+    job = os.urandom(3_000_001)
+    (outcome,) = LocalEngine(workers=1).run(doomed.identity, [job])
+    assert outcome.result == job
+
+
+def test_jobs_are_read_only_a_few_ahead() -> None:
+    """So that memory stays flat, however many there are."""
+    read = []
+    endless = (read.append(number) or number for number in iter(int, None))
+    outcomes = LocalEngine(workers=2).run(doomed.identity, endless)
+
+    for count, _ in enumerate(outcomes, 1):
+        assert len(read) <= count + 2 * 2 + 2
+        if count == 50:
+            break
+    outcomes.close()
+
+
+def test_the_same_worker_takes_job_after_job() -> None:
+    assert len({outcome.result for outcome in LocalEngine(workers=1).run(doomed.doze, [0.0] * 5)}) == 1
+
+
+def test_a_worker_that_keeps_much_is_replaced_before_the_next_job_pays_for_it() -> None:
+    engine = LocalEngine(workers=1, limits=Limits(memory=800 * doomed.MB))
+    outcomes = list(engine.run(doomed.keep, [500] * 3))
+
+    assert [outcome.casualty for outcome in outcomes] == [None] * 3
+    assert len({outcome.result for outcome in outcomes}) == 3
+
+
+def test_a_worker_killed_between_jobs_costs_nothing() -> None:
+    def jobs() -> Iterator[float]:
+        yield 0.0
+        yield 0.0
+        yield 0.0
+        for child in psutil.Process().children(recursive=True):
+            if child.pid in seen:
+                child.kill()
+                child.wait()
+        yield 0.0
+
+    seen: set[int] = set()
+    casualties = []
+    for outcome in LocalEngine(workers=1).run(doomed.doze, jobs()):
+        seen.add(outcome.result or 0)
+        casualties.append(outcome.casualty)
+    assert casualties == [None] * 4
+    assert len(seen) == 2
+
+
+def test_the_initializer_runs_in_the_worker() -> None:
+    engine = LocalEngine(workers=1, initializer=doomed.greet)
+    assert [outcome.result for outcome in engine.run(doomed.greeting, [0])] == ["good morning"]
+    assert doomed.greeting(0) is None
+
+
+@pytest.mark.parametrize("workers", [1, cores()])
+def test_workers_times_threads_are_no_more_than_cores(workers: int) -> None:
+    (outcome,) = LocalEngine(workers=workers).run(doomed.threads, [0])
+    assert outcome.result is not None
+    assert max(outcome.result) * workers <= cores()
+
+
+def test_a_worker_that_cannot_start_is_said_once_and_stops_the_run() -> None:
+    engine = LocalEngine(workers=1, initializer=doomed.refuse)
+    with pytest.raises(EngineError, match="no worker can be started: the worker ended with exit code 5"):
+        list(engine.run(doomed.identity, range(3)))
+
+
+def test_what_cannot_be_pickled_is_a_wrong_call() -> None:
+    with pytest.raises((AttributeError, TypeError), match="pickle"):
+        list(LocalEngine(workers=1).run(doomed.identity, [threading.Lock()]))
+
+
+@pytest.mark.parametrize("how", ["exception", "close"])
+def test_whoever_stops_reading_stops_the_workers(how: str) -> None:
+    outcomes = LocalEngine(workers=2).run(doomed.doze, [0.0, 1000.0, 1000.0, 1000.0])
+    pid = next(outcomes).result
+    assert pid is not None
+    started = time.monotonic()
+    if how == "close":
+        outcomes.close()
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            outcomes.throw(KeyboardInterrupt)
+    assert time.monotonic() - started < 5
+    assert not psutil.pid_exists(pid)
+
+
+COORDINATOR = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import doomed
+from autoalign.batch.engine import LocalEngine
+if __name__ == "__main__":
+    for outcome in LocalEngine(workers=2).run(doomed.doze, [0.0] * 4 + [1000.0] * 4):
+        print(outcome.result, flush=True)
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_worker_outlives_its_coordinator(tmp_path: Path, end: signal.Signals) -> None:
+    """Not even in the middle of a job, whatever the coordinator died of."""
+    script = tmp_path / "coordinator.py"
+    script.write_text(COORDINATOR)
+    command = [sys.executable, str(script), str(Path(__file__).parent)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as coordinator:
+        assert coordinator.stdout is not None
+        for _ in range(4):
+            assert coordinator.stdout.readline()
+        family = psutil.Process(coordinator.pid).children(recursive=True)
+        coordinator.send_signal(end)
+        gone, alive = psutil.wait_procs(family, timeout=5)
+        coordinator.wait(5)
+    assert len(gone) >= 3  # the workers, and the server that they come from
+    assert alive == []
+
+
+@pytest.mark.parametrize("engine", [InlineEngine(), LocalEngine(workers=2)])
+def test_engines_give_the_same(engine: Engine) -> None:
+    outcomes = by_job(engine.run(doomed.fall, ["error", "one", "two", "sys.exit"]))
+    casualties = {job: outcome.casualty.reason for job, outcome in outcomes.items() if outcome.casualty}
+
+    assert {job: outcome.result for job, outcome in outcomes.items()} == {
+        "error": None,
+        "one": "survived one",
+        "two": "survived two",
+        "sys.exit": None,
+    }
+    assert casualties == {"error": "ValueError: no such thing", "sys.exit": "SystemExit: bye"}
+
+
+def test_a_part_of_a_function_is_a_function() -> None:
+    power = functools.partial(pow, 2)
+    assert sorted(outcome.result or 0 for outcome in LocalEngine(workers=1).run(power, range(4))) == [1, 2, 4, 8]
+
+
+def test_stream_hands_out_what_comes_first() -> None:
+    waiting: list[Future[int]] = []
+
+    def submit(job: int) -> Future[int]:
+        future: Future[int] = Future()
+        waiting.append(future)
+        if len(waiting) == 3:  # the last one of the window is done first
+            future.set_result(job)
+        return future
+
+    results = stream(submit, range(3), ahead=3)
+    assert next(results) == 2
+    waiting[0].set_result(0)
+    assert next(results) == 0
+
+
+@pytest.mark.parametrize("wrong", [{"time_s": 0}, {"time_s": float("nan")}, {"memory": 0}])
+def test_limits_must_be_possible(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="limit must be over 0"):
+        Limits(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_machine_without_workers_is_no_engine() -> None:
+    with pytest.raises(ValueError, match="a worker at least"):
+        LocalEngine(workers=0)

@@ -102,6 +102,10 @@ class LedgerReader:
         """The keys of what is to be done, in the order of the plan."""
         return [key for (key,) in self._found(f"SELECT key FROM job WHERE {WAITS} ORDER BY place, name")]
 
+    def names(self) -> set[str]:
+        """Of all jobs, done or not."""
+        return {name for (name,) in self._found("SELECT name FROM job")}
+
     def rows(self, *statuses: RowStatus) -> Iterator[Row]:
         """What was done, or of it what has one of these statuses, in the order of the plan, whoever came first."""
         chosen = statuses or ROW_STATUSES
@@ -120,6 +124,18 @@ class LedgerReader:
         for fixed, before, after in self._found(f"{sql} WHERE name = {TEXT}", bound(name)):
             return Thumbnails(fixed=fixed, before=before, after=after)
         return None
+
+    def names(self) -> set[str]:
+        """Of all jobs, done or not."""
+        return {name for (name,) in self._found("SELECT name FROM job")}
+
+    def link(self, key: str) -> str | None:
+        """What `keep_link` was given; None if that is nothing."""
+        return next((data for (data,) in self._found("SELECT data FROM link WHERE key = ?", key)), None)
+
+    def link(self, key: str) -> str | None:
+        """What was kept of a link between two frames of a sequence; None if nothing was."""
+        return next((text for (text,) in self._found("SELECT text FROM link WHERE key = ?", key)), None)
 
     def runs(self) -> list[Run]:
         """Oldest first."""
@@ -233,6 +249,16 @@ class Ledger(LedgerReader):
             if thumbnails is not None:
                 sql = "INSERT INTO thumbnails (key, fixed_jpeg, before_jpeg, after_jpeg) VALUES (?, ?, ?, ?)"
                 database.execute(sql, (key, thumbnails.fixed, thumbnails.before, thumbnails.after))
+
+    def keep_link(self, key: str, data: str) -> None:
+        """Keep what was found of two frames of a sequence."""
+        with self._writing() as database:
+            database.execute("INSERT OR REPLACE INTO link (key, data) VALUES (?, ?)", (key, data))
+
+    def keep_link(self, key: str, text: str) -> None:
+        """Keep what became of a link: work on the way to rows, of which nothing is told, but which is not done twice."""
+        with self._writing() as database:
+            database.execute(f"INSERT OR REPLACE INTO link (key, text) VALUES (?, {TEXT})", (key, bound(text)))
 
     def reopen(self, names: Iterable[str]) -> None:
         """Forget what became of these, so that they wait again."""

@@ -50,6 +50,8 @@ SCHEMA = (
         path TEXT PRIMARY KEY, size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, inode INTEGER NOT NULL,
         sha256 TEXT NOT NULL
     )""",
+    "CREATE TABLE link (key TEXT PRIMARY KEY, data TEXT NOT NULL)",
+    "CREATE TABLE link (key TEXT PRIMARY KEY, text TEXT NOT NULL)",
     "CREATE TABLE run (started REAL NOT NULL, ended REAL, version TEXT NOT NULL, options TEXT NOT NULL)",
 )
 PLAN = f"""
