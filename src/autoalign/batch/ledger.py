@@ -125,17 +125,9 @@ class LedgerReader:
             return Thumbnails(fixed=fixed, before=before, after=after)
         return None
 
-    def names(self) -> set[str]:
-        """Of all jobs, done or not."""
-        return {name for (name,) in self._found("SELECT name FROM job")}
-
     def link(self, key: str) -> str | None:
         """What `keep_link` was given; None if that is nothing."""
         return next((data for (data,) in self._found("SELECT data FROM link WHERE key = ?", key)), None)
-
-    def link(self, key: str) -> str | None:
-        """What was kept of a link between two frames of a sequence; None if nothing was."""
-        return next((text for (text,) in self._found("SELECT text FROM link WHERE key = ?", key)), None)
 
     def runs(self) -> list[Run]:
         """Oldest first."""
@@ -254,11 +246,6 @@ class Ledger(LedgerReader):
         """Keep what was found of two frames of a sequence."""
         with self._writing() as database:
             database.execute("INSERT OR REPLACE INTO link (key, data) VALUES (?, ?)", (key, data))
-
-    def keep_link(self, key: str, text: str) -> None:
-        """Keep what became of a link: work on the way to rows, of which nothing is told, but which is not done twice."""
-        with self._writing() as database:
-            database.execute(f"INSERT OR REPLACE INTO link (key, text) VALUES (?, {TEXT})", (key, bound(text)))
 
     def reopen(self, names: Iterable[str]) -> None:
         """Forget what became of these, so that they wait again."""

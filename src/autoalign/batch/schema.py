@@ -51,7 +51,6 @@ SCHEMA = (
         sha256 TEXT NOT NULL
     )""",
     "CREATE TABLE link (key TEXT PRIMARY KEY, data TEXT NOT NULL)",
-    "CREATE TABLE link (key TEXT PRIMARY KEY, text TEXT NOT NULL)",
     "CREATE TABLE run (started REAL NOT NULL, ended REAL, version TEXT NOT NULL, options TEXT NOT NULL)",
 )
 PLAN = f"""
