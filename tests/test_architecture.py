@@ -50,6 +50,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
     },
     {
         "files": (
+            "boxes",
             "exif",
             "georeference",
             "microscope",
@@ -59,6 +60,11 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "png",
             "tiff",
             "pillow",
+            "avif",
+            "jpeg2000",
+            "jpegxl",
+            "heic",
+            "raw",
             "formats",
             "read",
             "write",
@@ -86,9 +92,10 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "ledger",
             "run",
             "chain",
+            "telling",
         )
     },
-    {"cli": ("terminal", "settings", "files", "view", "pair", "rectify", "apply", "main")},
+    {"cli": ("terminal", "settings", "files", "progress", "view", "pair", "rectify", "apply", "batch", "main")},
 )
 
 # Where a package outside the standard library may be imported. NumPy is everywhere.
@@ -107,12 +114,23 @@ HOMES: dict[str, tuple[str, ...]] = {
         "files.record",  # its version only
         "batch.slot",  # its threads only
     ),
-    "cyclopts": ("cli.terminal", "cli.settings", "cli.pair", "cli.rectify", "cli.apply", "cli.view", "cli.main"),
-    "imagecodecs": ("files.png",),
+    "cyclopts": (
+        "cli.terminal",
+        "cli.settings",
+        "cli.pair",
+        "cli.rectify",
+        "cli.apply",
+        "cli.batch",
+        "cli.view",
+        "cli.main",
+    ),
+    "imagecodecs": ("files.avif", "files.jpeg2000", "files.jpegxl", "files.png"),
     "lazy_loader": ("",),
+    "pillow_heif": ("files.heic",),
+    "rawpy": ("files.raw",),
     "psutil": ("batch.slot", "batch.ledger"),
     "rerun": ("views.viewer",),
-    "rich": ("cli.terminal",),
+    "rich": ("cli.terminal", "cli.progress"),
     "scipy": ("geometry.graph", "geometry.network"),
     "simplejpeg": ("files.jpeg",),
     "skimage": ("registration.alignment",),  # its ProjectiveTransform, for those who live there

@@ -12,7 +12,7 @@ import autoalign as aa
 from autoalign.batch import memory
 from autoalign.batch.jobs import Job, JobOptions, key
 from autoalign.batch.memory import PictureMemory
-from autoalign.batch.work import Task, align_task
+from autoalign.batch.work import Task, do_task
 from autoalign.errors import ImageReadError
 from autoalign.files.feature_store import recall_from
 from autoalign.registration.alignment import AlignOptions
@@ -31,7 +31,7 @@ def job(folder, tmp_path) -> Job:
 
 
 def test_an_aligned_pair_leaves_picture_sidecar_and_row(job, tmp_path):
-    done = align_task(Task(job=job, key="k"))
+    done = do_task(Task(job=job, key="k"))
     row = done.row
     assert row.status == "aligned"
     assert (row.output, row.sidecar, row.recording) == ("sub/frame2.png", "sub/frame2.png.autoalign.json", None)
@@ -46,10 +46,10 @@ def test_an_aligned_pair_leaves_picture_sidecar_and_row(job, tmp_path):
 
 
 def test_a_rejected_pair_leaves_no_picture_and_takes_that_of_an_earlier_run_away(job, folder):
-    align_task(Task(job=job, key="k"))
+    do_task(Task(job=job, key="k"))
     assert job.output.exists()
     (folder / "frame2.png").write_bytes((folder / "stranger.png").read_bytes())
-    done = align_task(Task(job=job, key="k2"))
+    done = do_task(Task(job=job, key="k2"))
     assert done.row.status == "rejected"
     assert done.row.output is None
     assert not job.output.exists()
@@ -58,7 +58,7 @@ def test_a_rejected_pair_leaves_no_picture_and_takes_that_of_an_earlier_run_away
 
 @pytest.mark.parametrize(("moving", "reason"), [("damaged.png", "damaged"), ("nowhere.png", "does not exist")])
 def test_a_bad_file_is_a_row(job, folder, moving, reason):
-    row = align_task(Task(job=replace(job, moving=str(folder / moving)), key="k")).row
+    row = do_task(Task(job=replace(job, moving=str(folder / moving)), key="k")).row
     assert row.status == "failed"
     assert reason in row.reason
     assert row.reason.endswith(moving)
@@ -67,7 +67,7 @@ def test_a_bad_file_is_a_row(job, folder, moving, reason):
 
 def test_recordings_of_those_that_were_asked_for(job):
     for recorded, expected in (("none", False), ("failed", False), ("all", True), ("none", False)):
-        row = align_task(Task(job=replace(job, options=JobOptions(recorded=recorded)), key="k")).row
+        row = do_task(Task(job=replace(job, options=JobOptions(recorded=recorded)), key="k")).row
         assert (row.recording is not None) == job.recording.exists() == expected
 
 
@@ -142,10 +142,10 @@ def test_features_are_kept_on_disk_and_found_again(folder, tmp_path):
 
 
 def test_remembered_features_give_the_same_bits(job, tmp_path):
-    plain = align_task(Task(job=job, key="k"))
+    plain = do_task(Task(job=job, key="k"))
     before = job.sidecar.read_bytes(), job.output.read_bytes()
     for _ in range(2):
-        stored = align_task(Task(job=job, key="k", store=str(tmp_path), again=frozenset(job.inputs)))
+        stored = do_task(Task(job=job, key="k", store=str(tmp_path), again=frozenset(job.inputs)))
         assert stored == plain
         assert (job.sidecar.read_bytes(), job.output.read_bytes()) == before
     picture = prepare(aa.read_picture(job.fixed).pixels)

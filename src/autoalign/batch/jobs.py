@@ -5,17 +5,24 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
+import numpy as np
+
 from autoalign import __version__
+from autoalign.errors import ImageReadError
 from autoalign.files.write import default_output
+from autoalign.picture.border import like_bordered
+from autoalign.picture.pixels import Picture, has_alpha
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
+from autoalign.registration.sequence import SequenceFrame
 
 Recorded = Literal["none", "failed", "all"]
+GREY_PIXEL: Picture = np.zeros((1, 1), np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +45,13 @@ class Job:
     options: JobOptions = JobOptions()
     fixed_mask: str | None = None  # a picture that is not black where the fixed one is to be ignored
     moving_mask: str | None = None
+    placed: SequenceFrame | None = None  # where a whole sequence puts it; None where that is to be found out
 
     @property
     def output(self) -> Path:
         """The aligned picture: the moving one's name and format, or a format that can be written behind its name."""
-        suffix = default_output(self.name).suffix
+        like = like_bordered(GREY_PIXEL, self.options.drawing.border)
+        suffix = default_output(self.name, like if has_alpha(like) else None).suffix
         path = Path(self.out_dir, *PurePosixPath(self.name).parts)
         return path if path.suffix == suffix else path.with_name(path.name + suffix)
 
@@ -59,6 +68,11 @@ class Job:
     def inputs(self) -> tuple[str, ...]:
         return tuple(path for path in (self.fixed, self.moving, self.fixed_mask, self.moving_mask) if path)
 
+    @property
+    def outputs(self) -> tuple[Path, Path, Path]:
+        """All that it may write."""
+        return self.output, self.sidecar, self.recording
+
     def _beside(self, ending: str) -> Path:
         return Path(self.out_dir, *PurePosixPath(self.name + ending).parts)
 
@@ -69,8 +83,28 @@ def key(job: Job, hash_of: Callable[[str], str]) -> str:
     `hash_of` gives the hash of the content behind a path.
     """
     inputs = [path and hash_of(path) for path in (job.fixed, job.moving, job.fixed_mask, job.moving_mask)]
-    words = [job.name, *(word or "" for word in inputs), _digest(job.options)]
+    words = [job.name, *(word or "" for word in inputs), _digest(job.options), _place(job.placed)]
     return hashlib.sha256("\0".join(words).encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def readable(hash_of: Callable[[str], str]) -> Callable[[str], str]:
+    """`hash_of` with a word for what cannot be read, which changes as soon as it can: the worker will say why."""
+
+    def hash_or_word(path: str) -> str:
+        try:
+            return hash_of(path)
+        except ImageReadError:
+            return "unreadable"
+
+    return hash_or_word
+
+
+def _place(frame: SequenceFrame | None) -> str:
+    """All that a sequence says of a frame, to the last bit."""
+    if frame is None:
+        return ""
+    transform = frame.reference_from_frame
+    return json.dumps(asdict(replace(frame, reference_from_frame=None))) + repr(transform is None or transform.tolist())
 
 
 @lru_cache(maxsize=1024)

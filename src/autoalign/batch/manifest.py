@@ -14,7 +14,8 @@ from autoalign.batch.jobs import Job, JobOptions
 from autoalign.errors import ImageReadError
 from autoalign.files.formats import of_name
 
-NEEDED, OWN = ("fixed", "moving"), ("name", "fixed_mask", "moving_mask")
+NEEDED, MASKS = ("fixed", "moving"), ("fixed_mask", "moving_mask")
+OWN = (*NEEDED, "name", *MASKS)
 
 
 def manifest_jobs(text: str, source: str, base: Path, out_dir: Path, options: JobOptions) -> list[Job]:
@@ -52,7 +53,7 @@ def _rows(text: str) -> Iterator[tuple[int, dict[str, str]]]:
 
 def _columns(names: Sequence[str]) -> list[str]:
     columns = [name.lower().replace("-", "_") for name in names]
-    known = {*NEEDED, *OWN, *_option_types(JobOptions)}
+    known = {*OWN, *_option_types(JobOptions)}
     for column in columns:
         if columns.count(column) > 1:
             raise ValueError(f"names the column {column} twice")
@@ -69,14 +70,15 @@ def _job(line: int, row: Mapping[str, str], name: str, base: Path, out_dir: Path
         missing = [column for column in NEEDED if column not in row]
         if missing:
             raise ValueError(f"{missing[0]} is empty")
-        masks = {column: _absolute(base, row[column]) for column in ("fixed_mask", "moving_mask") if column in row}
+        masks = {column: _absolute(base, row[column]) if column in row else None for column in MASKS}
         return Job(
             name=_inside(_with_extension(row.get("name", name), row["moving"])),
             fixed=_absolute(base, row["fixed"]),
             moving=_absolute(base, row["moving"]),
             out_dir=str(out_dir),
-            options=with_cells(options, {key: cell for key, cell in row.items() if key not in (*NEEDED, *OWN)}),
-            **masks,
+            options=with_cells(options, {key: cell for key, cell in row.items() if key not in OWN}),
+            fixed_mask=masks["fixed_mask"],
+            moving_mask=masks["moving_mask"],
         )
     except ValueError as error:
         raise ValueError(f"line {line}: {error}") from None

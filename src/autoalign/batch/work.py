@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
@@ -10,10 +11,10 @@ from autoalign.batch.jobs import Job
 from autoalign.batch.memory import PictureMemory, Ready
 from autoalign.errors import CanvasError, ImageReadError, ImageWriteError
 from autoalign.files.read import LoadedPicture
-from autoalign.files.record import record
+from autoalign.files.record import placed_record, record
 from autoalign.files.result import ResultFiles, write_result
 from autoalign.files.row import Row, Thumbnails
-from autoalign.files.sidecar import as_shown, write_sidecar
+from autoalign.files.sidecar import Sidecar, transform_of, write_sidecar
 from autoalign.files.write import write_bytes_atomically
 from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment
@@ -26,8 +27,15 @@ class Task:
 
     job: Job
     key: str
-    store: str | None = None  # folder where the features of pictures that come again are kept
+    store: str | None = None  # folder where the features of the pictures in `again` are kept
     again: frozenset[str] = frozenset()  # the inputs that come again in other jobs
+
+    def ready(self) -> tuple[Ready, Ready]:
+        """The fixed and the moving picture, from the memory of this process if it has them; ImageReadError if not."""
+        return self._ready(self.job.fixed, self.job.fixed_mask), self._ready(self.job.moving, self.job.moving_mask)
+
+    def _ready(self, path: str, mask: str | None) -> Ready:
+        return _memory().ready(path, mask, self.store if path in self.again else None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,29 +46,37 @@ class Done:
     thumbnails: Thumbnails | None = None
 
 
-def align_task(task: Task) -> Done:
-    """Align one pair and write what is kept of it; what is wrong with its files is a row as well."""
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """Where the moving picture goes, and how that is known."""
+
+    kept: Sidecar
+    alignment: Alignment | None = None  # None where a whole sequence has decided
+    advice: str = ""
+
+
+def do_task(task: Task) -> Done:
+    """Find out where one picture goes, unless that is known, and write what is kept of it.
+
+    What is wrong with its files is a row as well.
+    """
     job = task.job
     try:
-        fixed = _ready(task, job.fixed, job.fixed_mask)
-        moving = _ready(task, job.moving, job.moving_mask)
-        alignment = align(fixed.prepared, moving.prepared, job.options.align)
-        row = _write(job, alignment, fixed.loaded, moving.loaded)
+        fixed, moving = task.ready()
+        found = _find(job, fixed, moving)
+        written = _write(job, found, fixed.loaded, moving.loaded)
     except (ImageReadError, ImageWriteError, CanvasError, ValueError) as error:
         return Done(row=failed_row(job, str(error)))
-    transform = None if alignment.status == "rejected" else alignment.fixed_from_moving
-    return Done(row=row, thumbnails=thumbnails(fixed.loaded.pixels, moving.loaded.pixels, transform))
+    transform = None if found.kept.fixed_from_moving is None else transform_of(found.kept)
+    small = thumbnails(fixed.loaded.pixels, moving.loaded.pixels, transform)
+    return Done(row=_row(job, found, written), thumbnails=small)
 
 
 def failed_row(job: Job, reason: str) -> Row:
     """The row of a job that could not be tried or finished; nothing of an earlier run may pass for its result."""
-    for path in (job.output, job.sidecar, job.recording):
+    for path in job.outputs:
         path.unlink(missing_ok=True)
     return Row(name=job.name, fixed=job.fixed, moving=job.moving, status="failed", reason=reason)
-
-
-def _ready(task: Task, path: str, mask: str | None) -> Ready:
-    return _memory().ready(path, mask, task.store if path in task.again else None)
 
 
 @cache
@@ -69,56 +85,56 @@ def _memory() -> PictureMemory:
     return PictureMemory()
 
 
-def _write(job: Job, alignment: Alignment, fixed: LoadedPicture, moving: LoadedPicture) -> Row:
-    """The files of a pair, and its row. They replace those of an earlier run, whose pair has changed since."""
+def _find(job: Job, fixed: Ready, moving: Ready) -> _Found:
+    drawn = asdict(job.options.drawing)
+    if job.placed is not None:
+        return _Found(kept=placed_record(job.placed, fixed.loaded, moving.loaded, job.options.align, drawn=drawn))
+    alignment = align(fixed.prepared, moving.prepared, job.options.align)
+    kept = record(alignment, fixed.loaded, moving.loaded, drawn=drawn)
+    return _Found(kept=kept, alignment=alignment, advice=alignment.verdict.advice)
+
+
+def _write(job: Job, found: _Found, fixed: LoadedPicture, moving: LoadedPicture) -> set[Path]:
+    """The files of a pair. Those of an earlier run, when the pair was another, are replaced or taken away."""
     job.output.parent.mkdir(parents=True, exist_ok=True)
-    aligned = alignment.status == "aligned"
+    aligned = found.kept.status == "aligned"
+    written = {job.sidecar}
     if aligned:
-        transform = alignment.fixed_from_moving
-        write_result(ResultFiles(aligned=job.output), fixed, moving, transform, job.options.drawing, overwrite=True)
-    else:
-        job.output.unlink(missing_ok=True)
-    kept = record(alignment, fixed, moving, drawn=asdict(job.options.drawing))
-    write_sidecar(job.sidecar, kept, overwrite=True)
-    recorded = job.options.recorded == "all" or (job.options.recorded == "failed" and not aligned)
-    if recorded:
-        _record(job, alignment, fixed, moving)
-    else:
-        job.recording.unlink(missing_ok=True)
-    return replace(
-        _row(job, alignment),
-        output=_inside(job.output, job) if aligned else None,
-        sidecar=_inside(job.sidecar, job),
-        recording=_inside(job.recording, job) if recorded else None,
-    )
+        files = ResultFiles(aligned=job.output)
+        written.update(
+            write_result(files, fixed, moving, transform_of(found.kept), job.options.drawing, overwrite=True)
+        )
+    write_sidecar(job.sidecar, found.kept, overwrite=True)
+    if found.alignment and (job.options.recorded == "all" or (job.options.recorded == "failed" and not aligned)):
+        from autoalign.views.viewer import recorded  # not above: rerun is loaded where it is asked for only
+
+        write_bytes_atomically(job.recording, recorded(fixed, moving, found.alignment), overwrite=True)
+        written.add(job.recording)
+    for path in job.outputs:
+        if path not in written:
+            path.unlink(missing_ok=True)
+    return written
 
 
-def _record(job: Job, alignment: Alignment, fixed: LoadedPicture, moving: LoadedPicture) -> None:
-    from autoalign.views.viewer import recorded  # not above: rerun is loaded where recordings are asked for only
-
-    write_bytes_atomically(job.recording, recorded(fixed, moving, alignment), overwrite=True)
-
-
-def _row(job: Job, alignment: Alignment) -> Row:
+def _row(job: Job, found: _Found, written: Iterable[Path]) -> Row:
+    kept, names = found.kept, {path: path.relative_to(job.out_dir).as_posix() for path in written}
     return Row(
         name=job.name,
         fixed=job.fixed,
         moving=job.moving,
-        status=alignment.status,
-        reason=alignment.reason,
-        expected_error_px=alignment.expected_error_px,
-        model=alignment.model,
-        fixed_from_moving=None if alignment.status == "rejected" else as_shown(alignment.fixed_from_moving),
-        fixed_size=alignment.fixed_size,
-        moving_size=alignment.moving_size,
-        matches=alignment.matches,
-        inliers=alignment.inliers,
-        overlap=alignment.overlap,
-        rung=alignment.best.rung,
-        advice=alignment.verdict.advice,
+        status=kept.status,
+        reason=kept.reason,
+        expected_error_px=kept.expected_error_px,
+        model=kept.model,
+        fixed_from_moving=kept.fixed_from_moving,
+        fixed_size=kept.fixed.size,
+        moving_size=kept.moving.size,
+        matches=kept.stages.get("matches", 0),
+        inliers=kept.stages.get("inliers", 0),
+        overlap=kept.evidence.get("overlap", 0.0),
+        rung=kept.stages.get("rung"),
+        advice=found.advice,
+        output=names.get(job.output),
+        sidecar=names.get(job.sidecar),
+        recording=names.get(job.recording),
     )
-
-
-def _inside(path: Path, job: Job) -> str:
-    """The path relative to the batch's folder, with slashes."""
-    return path.relative_to(job.out_dir).as_posix()

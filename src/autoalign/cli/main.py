@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 from autoalign import __version__
 from autoalign.cli import settings
 from autoalign.cli.terminal import Exit, complain
-from autoalign.errors import AlignmentError, CanvasError, ImageReadError, ImageWriteError
+from autoalign.errors import AlignmentError, CanvasError, EngineError, ImageReadError, ImageWriteError
 
 COMMANDS = {
     "pair": """\
@@ -25,6 +25,15 @@ which `autoalign apply` makes the picture once you have looked, and the overlay 
 gives the record only, with the reason.
 
 Exit code: 0 aligned, 1 doubtful or rejected, 2 wrong usage, 3 a file could not be read or written.
+""",
+    "batch": """\
+Align many pairs: a folder onto one picture, a time-lapse, brackets, or a manifest.
+
+Each moving picture keeps its name and format in --out-dir; beside it lies its record, and there are report.html and a \
+ledger of what is done. The same command again does only what is new or has changed, so it may be stopped at any time. \
+A pair that is not aligned, or a file that cannot be read, is a line in the report and stops nothing.
+
+Exit code: 0 all aligned, 1 some are not, 2 wrong usage, 3 some could not be read or written.
 """,
     "rectify": """\
 Show a plane in IMAGE upright and to scale, from four or more points on it.
@@ -53,6 +62,7 @@ Exit code: 0 done, 2 wrong usage, 3 a file could not be read, or there is no dis
 """Command to help text, whose first line `autoalign --help` shows; each lives in the module of its name."""
 
 USAGE = {
+    "batch": "Usage: autoalign batch --out-dir FOLDER [OPTIONS] FOLDER|MANIFEST.csv|-",
     "apply": "Usage: autoalign apply [OPTIONS] SIDECAR [IMAGES...]",
     "view": "Usage: autoalign view [OPTIONS] FILE.rrd|SIDECAR...",
 }  # what cannot be told from the signature
@@ -88,6 +98,7 @@ EXIT_OF: dict[type[BaseException], Exit] = {
     AlignmentError: Exit.NOT_ALIGNED,
     CanvasError: Exit.NOT_ALIGNED,
     MemoryError: Exit.NOT_ALIGNED,
+    EngineError: Exit.NOT_ALIGNED,
     ImageReadError: Exit.FILE,
     ImageWriteError: Exit.FILE,
     OSError: Exit.FILE,  # the terminal or the pipe behind stdout is gone or full

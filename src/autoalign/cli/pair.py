@@ -11,7 +11,7 @@ from typing import Annotated
 from cyclopts import Group, Parameter
 
 from autoalign.cli.files import SCREEN_PIXEL, check_mask_format, check_outputs
-from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
+from autoalign.cli.terminal import FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
 from autoalign.cli.view import Viewing, check_viewing, recording_beside, show
 from autoalign.files.points import CORRESPONDENCES, read_points
 from autoalign.files.read import LoadedPicture, read_picture
@@ -37,7 +37,6 @@ for stage, heading in ((RansacOptions, "Consensus"), (RefineOptions, "Refinement
     Parameter(name="*", group=Group(heading, sort_key=3))(stage)
 
 STDOUT = Path("-")
-STYLE_OF = {"aligned": "bold green", "doubtful": "bold yellow", "rejected": "bold red"}
 
 
 @dataclass(frozen=True, kw_only=True)

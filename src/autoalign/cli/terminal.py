@@ -12,6 +12,10 @@ from cyclopts import Group, Parameter
 FILES, GENERAL = Group("Files", sort_key=1), Group("General", sort_key=4)
 
 
+STYLE_OF = {"aligned": "bold green", "doubtful": "bold yellow", "rejected": "bold red", "failed": "bold magenta"}
+"""Verdicts as the terminal shows them."""
+
+
 class Exit(IntEnum):
     """What the exit code of every command means."""
 

@@ -15,7 +15,8 @@ from autoalign import __version__
 from autoalign.files.read import LoadedPicture
 from autoalign.files.sidecar import PictureRecord, Sidecar, as_shown
 from autoalign.picture.pixels import size_of
-from autoalign.registration.alignment import Alignment
+from autoalign.registration.alignment import Alignment, AlignOptions
+from autoalign.registration.sequence import SequenceFrame
 
 
 def record(
@@ -44,6 +45,31 @@ def record(
         stages=alignment.counts(),
         evidence={name: _finite(value) for name, value in alignment.evidence().items()},
         timings_s=alignment.seconds if timings else None,
+    )
+
+
+def placed_record(
+    frame: SequenceFrame,
+    fixed: LoadedPicture,
+    moving: LoadedPicture,
+    options: AlignOptions,
+    *,
+    drawn: Mapping[str, Any],
+) -> Sidecar:
+    """All that is kept of a frame of a sequence, which the links of the whole sequence have put onto the reference."""
+    transform = frame.reference_from_frame
+    return Sidecar(
+        status=frame.status,
+        reason=frame.reason,
+        fixed_from_moving=None if transform is None else as_shown(transform),
+        expected_error_px=frame.expected_error_px,
+        model=frame.model,
+        fixed=_picture(fixed),
+        moving=_picture(moving),
+        options=asdict(options) | dict(drawn),
+        versions=versions(),
+        stages={"links_used": frame.used, "links_overruled": frame.overruled},
+        evidence={},
     )
 
 

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from autoalign.errors import ImageWriteError
 from autoalign.files.codec import one_line
-from autoalign.files.formats import FORMATS, PNG, TIFF, Format, encoder_for, of_name
+from autoalign.files.formats import FORMATS, Format, default_for, encoder_for, of_name
 from autoalign.files.metadata import Metadata, describing
 from autoalign.picture.pixels import Picture, check_picture, has_alpha, size_of
 
@@ -30,9 +30,10 @@ def write_picture(
     """Write a picture (h, w) or (h, w, c), in the format that the extension says, with what travels with it.
 
     The same pixels and metadata give the same bytes. JPEG at `jpeg_quality` (1 to 100) with colours at full
-    resolution; all other formats are lossless. Raises ImageWriteError, the path last, if the format cannot hold these
-    pixels (`check_format`) or the file cannot be written (`check_writable`, a full disk); then nothing is left behind,
-    and a file that was there is as it was. Raises ValueError if `pixels` is no picture or the quality is out of range.
+    resolution, AVIF nearly lossless; all other formats are lossless. Raises ImageWriteError, the path last, if the
+    format cannot hold these pixels (`check_format`) or the file cannot be written (`check_writable`, a full disk); then
+    nothing is left behind, and a file that was there is as it was. Raises ValueError if `pixels` is no picture or the
+    quality is out of range.
     """
     if not 1 <= jpeg_quality <= 100:
         raise ValueError(f"jpeg_quality must be 1 to 100, not {jpeg_quality}")
@@ -63,22 +64,32 @@ def writing_atomically(path: str | Path, overwrite: bool = False) -> Iterator[Ca
 
     Raises ImageWriteError, the path last, as `write_bytes_atomically` does.
     """
+    with file_atomically(path, overwrite) as file:
+
+        def write(data: bytes) -> None:
+            with blaming(Path(path)):
+                file.write(data)
+
+        yield write
+
+
+@contextmanager
+def file_atomically(path: str | Path, overwrite: bool = False) -> Iterator[BinaryIO]:
+    """A new file, to be written and read, that is at `path` once the block has ended well; else nothing is left behind.
+
+    Raises ImageWriteError, the path last, as `write_bytes_atomically` does, but for what goes wrong inside the block.
+    """
     path = Path(path)
     check_writable(path, overwrite)
     # Beside the file, because a rename is atomic only within one file system; a short name, because long ones may fail.
     temporary = path.with_name(TEMPORARY.format(secrets.token_hex(8)))
     try:
         with _new_file(temporary, path) as file:
-
-            def write(data: bytes) -> None:
-                with _blaming(path):
-                    file.write(data)
-
-            yield write
-            with _blaming(path):
+            yield file
+            with blaming(path):
                 file.flush()
                 os.fsync(file.fileno())
-        with _blaming(path):
+        with blaming(path):
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -125,32 +136,31 @@ def default_output(moving_path: str | Path, pixels: Picture | None = None) -> Pa
     """Where the aligned picture goes if nobody says: `<moving>_aligned<ext>` beside the moving picture.
 
     Where the format of the moving picture cannot be written, or cannot hold `pixels`, the extension is .png, or .tif
-    for what PNG cannot hold.
+    for what PNG cannot hold and for raw files of cameras.
     """
     path = Path(moving_path)
     format = of_name(path)
     extension = path.suffix
     if format is None or not (format.depths if pixels is None else format.holds(pixels)):
-        fallback = PNG if pixels is None or PNG.holds(pixels) else TIFF
-        extension = fallback.extensions[0]
+        extension = default_for(format, pixels).extensions[0]
     return path.with_name(f"{path.stem}_aligned{extension}")
 
 
 @contextmanager
 def _new_file(temporary: Path, path: Path) -> Iterator[BinaryIO]:
     """A file that was not there before; whatever goes wrong with it is said of `path`."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)  # the last one on Windows only
-    with _blaming(path):
-        file = open(os.open(temporary, flags, NEW_FILE_MODE), "wb")
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)  # the last one on Windows only
+    with blaming(path):
+        file = open(temporary, "w+b", opener=lambda name, _: os.open(name, flags, NEW_FILE_MODE))
     try:
         yield file
     finally:
-        with _blaming(path):  # closing writes too, once more where it failed before
+        with blaming(path):  # closing writes too, once more where it failed before
             file.close()
 
 
 @contextmanager
-def _blaming(path: Path) -> Iterator[None]:
+def blaming(path: Path) -> Iterator[None]:
     """Turns what an operating system raises into the error that names this file."""
     try:
         yield

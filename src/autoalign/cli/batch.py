@@ -1,0 +1,236 @@
+"""`autoalign batch`: many pairs, nobody watching."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Group, Parameter
+
+from autoalign.batch.chain import link_up, place
+from autoalign.batch.engine import Engine, LocalEngine
+from autoalign.batch.jobs import Job, JobOptions, Recorded
+from autoalign.batch.ledger import FILE_NAME as LEDGER
+from autoalign.batch.ledger import Ledger, LedgerReader
+from autoalign.batch.manifest import manifest_jobs
+from autoalign.batch.run import carry_out, feature_store, planned
+from autoalign.batch.slot import Limits
+from autoalign.batch.sources import Selection, in_groups, onto_reference, pictures, place_of_reference
+from autoalign.batch.telling import write_reports
+from autoalign.cli.progress import clock, following, tally
+from autoalign.cli.terminal import FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
+from autoalign.errors import ImageWriteError
+from autoalign.files.read import read_text
+from autoalign.files.row import Row
+from autoalign.registration.alignment import AlignOptions
+from autoalign.registration.drawing import Drawing
+from autoalign.registration.sequence import SequenceOptions, links
+
+STDIN = Path("-")
+MAX_MANIFEST_BYTES, GB = 1 << 28, 1e9
+TOLD = 10  # pairs that are not aligned, at the end
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchFiles:
+    """What goes onto what, and where the results go."""
+
+    out_dir: Path
+    """folder for the results; there the same command finds what it has done already"""
+    reference: str | None = None
+    """picture that all others of the folder go onto; for --sequence and --pattern also first or middle"""
+    sequence: bool = False
+    """the pictures are a time-lapse or a stack: linked with each other, and put onto one of them without drift"""
+    pattern: str | None = None
+    """regular expression: names with the same text in its first bracket go together, as exposures of one view do"""
+    save_rrd: Recorded = "none"
+    """also record pairs for `autoalign view`: those that are not aligned, or all"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Running:
+    """How the work is gone about."""
+
+    plan: bool = False
+    """only say what would be done"""
+    retry: Literal["failed"] | None = None
+    """also do again what failed before"""
+    fail_fast: bool = False
+    """stop at the first pair that fails, as by a file that cannot be read"""
+    workers: int | None = None
+    """pairs at a time; by default as many as there are cores"""
+    cache: Path | None = None
+    """folder to keep the keypoints of all pictures in, for other batches"""
+    kill_after: float = 600.0
+    """seconds after which a pair is given up"""
+    max_memory: float = 8.0
+    """gigabytes of memory at which a pair is given up"""
+
+
+def batch(
+    source: Path,
+    /,
+    *,
+    files: Annotated[BatchFiles, Parameter(name="*", group=FILES)],
+    selection: Annotated[Selection, Parameter(name="*", group=FILES)] = Selection(),
+    drawing: Annotated[Drawing, Parameter(name="*", group=FILES)] = Drawing(),
+    running: Annotated[Running, Parameter(name="*", group=Group("Running", sort_key=1.5))] = Running(),
+    options: Annotated[AlignOptions, Parameter(name="*", group=Group("Alignment", sort_key=2))] = AlignOptions(),
+    common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
+) -> int:
+    """Plan, do what is not done yet, report.
+
+    Parameters
+    ----------
+    source
+        a folder, or a manifest: CSV with the columns fixed, moving and, if wanted, name and options; - is stdin
+    """
+    started = time.monotonic()
+    wanted = JobOptions(align=options, drawing=drawing, recorded=files.save_rrd)
+    jobs, reference = _jobs(source, files, selection, wanted)
+    if running.plan:
+        return _tell_plan(jobs, reference, files.out_dir)
+    _make(files.out_dir)
+    with Ledger(files.out_dir) as ledger, feature_store(files.out_dir, running.cache) as store:
+        engine = LocalEngine(
+            workers=running.workers, limits=Limits(time_s=running.kill_after, memory=round(running.max_memory * GB))
+        )
+        about = {"source": str(source)} | _words(files) | _words(selection) | _words(drawing) | _words(options)
+        ledger.begin_run(about)
+        if reference is not None:
+            jobs = _placed(jobs, reference, ledger, engine, store, common)
+        plan = planned(
+            jobs,
+            files.out_dir,
+            ledger,
+            store,
+            retry=running.retry == "failed",
+            overwrite=common.overwrite,
+            remember_all=running.cache is not None,
+        )
+        with following("pairs", len(plan.tasks), common.quiet) as follow:
+            for row in carry_out(plan, ledger, engine, fail_fast=running.fail_fast):
+                follow(row.status)
+        mine = {job.name for job in jobs}
+        rows = [row for row in ledger.rows() if row.name in mine]
+        report = write_reports(files.out_dir, ledger, about, sequence=files.sequence)
+    _tell_end(rows, len(jobs), plan.done, time.monotonic() - started, common)
+    note(f"report: {report}", common)
+    return _exit(rows, len(jobs))
+
+
+def _jobs(source: Path, files: BatchFiles, selection: Selection, options: JobOptions) -> tuple[list[Job], int | None]:
+    """What the source holds; for a sequence, which is the frame that the others go onto."""
+    if source != STDIN and source.is_dir():
+        return _of_folder(source, files, selection, options)
+    wrong = [name for name in ("reference", "sequence", "pattern") if getattr(files, name)]
+    wrong += [name for name, value in asdict(selection).items() if value]
+    if wrong:
+        raise ValueError(f"--{wrong[0]} is for folders, and this is a manifest: {source}")
+    if source == STDIN:
+        return manifest_jobs(sys.stdin.read(), "stdin", Path.cwd(), files.out_dir, options), None
+    text = read_text(source, max_bytes=MAX_MANIFEST_BYTES)
+    return manifest_jobs(text, str(source), source.parent.absolute(), files.out_dir, options), None
+
+
+def _of_folder(
+    folder: Path, files: BatchFiles, selection: Selection, options: JobOptions
+) -> tuple[list[Job], int | None]:
+    names = pictures(folder, selection, without=files.out_dir)
+    if files.sequence and files.pattern:
+        raise ValueError("--sequence and --pattern exclude each other")
+    if files.pattern:
+        return in_groups(folder, names, files.pattern, files.reference or "first", files.out_dir, options), None
+    if files.sequence:
+        if files.save_rrd != "none":
+            raise ValueError("--save-rrd is for pairs: a frame of a sequence rests on many")
+        reference = _frame(folder, names, files.reference or "first")
+        fixed = str(folder / names[reference])
+        frames = [
+            Job(name=name, fixed=fixed, moving=str(folder / name), out_dir=str(files.out_dir), options=options)
+            for name in names
+        ]
+        return frames, reference
+    if files.reference is None:
+        raise ValueError(f"needs --reference FILE, --sequence or --pattern for a folder: {folder}")
+    return onto_reference(folder, names, Path(files.reference), files.out_dir, options), None
+
+
+def _frame(folder: Path, names: Sequence[str], reference: str) -> int:
+    """The number of the frame that the others go onto."""
+    if reference in ("first", "middle"):
+        return place_of_reference(reference, len(names))
+    wanted = Path(reference).resolve()
+    for number, name in enumerate(names):
+        if (folder / name).resolve() == wanted:
+            return number
+    raise ValueError(f"is none of the frames of {folder}: {reference}")
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ImageWriteError(f"cannot be made a folder for the results ({error.strerror}): {folder}") from None
+
+
+def _tell_plan(jobs: Sequence[Job], reference: int | None, out_dir: Path) -> Exit:
+    """A line for each job that would be done, and nothing done."""
+    known = {}
+    if (out_dir / LEDGER).exists():
+        with LedgerReader(out_dir) as ledger:
+            known = {row.name: row.status for row in ledger.rows()}
+    for job in jobs:
+        before = f" ({known[job.name]} before)" if job.name in known else ""
+        print(f"{job.moving} -> {job.fixed}: {job.output}{before}")
+    again = sum(job.name in known for job in jobs)
+    chained = f", after {len(links(len(jobs), reference)):,} links between frames" if reference is not None else ""
+    tell(f"{len(jobs):,} pairs{chained}; {again:,} were done before, and only those that changed will be done again")
+    return Exit.DONE
+
+
+def _placed(
+    frames: Sequence[Job], reference: int, ledger: Ledger, engine: Engine, store: Path, common: Common
+) -> list[Job]:
+    """Every frame where all links of the sequence together put it."""
+    linked = []
+    with following("links", len(links(len(frames), reference)), common.quiet) as follow:
+        for one in link_up(frames, reference, ledger, engine, store):
+            linked.append(one)
+            follow(one.link.status)
+    return place(frames, reference, linked, SequenceOptions())
+
+
+def _words(options: Any) -> dict[str, str]:
+    """The options that are not as they are by default, as words."""
+    return {
+        f"--{field.name.replace('_', '-')}": str(value)
+        for field in fields(options)
+        if (value := getattr(options, field.name)) != field.default and not is_dataclass(value)
+    }
+
+
+def _tell_end(rows: Sequence[Row], total: int, plan_done: int, seconds: float, common: Common) -> None:
+    """The counts on stdout, and on stderr what a person should look at."""
+    if common.quiet:
+        return
+    counts = Counter(row.status for row in rows)
+    left = f", {total - len(rows):,} not done" if total > len(rows) else ""
+    before = f", {plan_done:,} of them done before" if plan_done else ""
+    tell(f"{total:,} pairs: {tally(counts)}{left}{before} ({clock(seconds)})")
+    wrong = [row for row in rows if row.status != "aligned"]
+    for row in wrong[:TOLD]:
+        tell(f"{row.status} {row.name}: {row.reason}", style=STYLE_OF[row.status], to_stderr=True)
+    if len(wrong) > TOLD:
+        tell(f"... and {len(wrong) - TOLD:,} more that are not aligned", to_stderr=True)
+
+
+def _exit(rows: Sequence[Row], total: int) -> Exit:
+    if any(row.status == "failed" for row in rows):
+        return Exit.FILE
+    return Exit.DONE if len(rows) == total and all(row.status == "aligned" for row in rows) else Exit.NOT_ALIGNED
