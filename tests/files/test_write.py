@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imagecodecs
 import numpy as np
 import pytest
 import tifffile
@@ -30,6 +31,8 @@ LOSSLESS = {
     ".tif": [np.uint8, np.uint16, np.float32],
     ".webp": [np.uint8],
     ".bmp": [np.uint8],
+    ".jp2": [np.uint8, np.uint16],
+    ".jxl": [np.uint8, np.uint16, np.float32],
 }
 HELD = [
     (extension, depth, channels)
@@ -63,6 +66,10 @@ def in_colour(pixels: Any) -> Any:
 def by_other_library(path: Path, channels: int) -> Any:
     if path.suffix == ".tif":
         return tifffile.imread(path)
+    if path.suffix == ".jxl":  # no second library that reads it is at hand
+        return imagecodecs.jpegxl_decode(path.read_bytes())
+    if path.suffix == ".jp2" and channels == 2:
+        return imagecodecs.jpeg2k_decode(path.read_bytes())
     if path.suffix == ".png" and channels == 2:  # OpenCV makes four channels of these two
         return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., [0, 3]]
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -110,7 +117,7 @@ def test_quality_of_a_jpeg(tmp_path: Path, make_picture: Any) -> None:
         write_picture(tmp_path / "a.jpg", make_picture(), jpeg_quality=0)
 
 
-@pytest.mark.parametrize("extension", [".jpg", ".png", ".tif", ".webp", ".bmp"])
+@pytest.mark.parametrize("extension", [".jpg", ".png", ".tif", ".webp", ".bmp", ".avif", ".jp2", ".jxl"])
 def test_same_picture_same_bytes(tmp_path: Path, make_picture: Any, extension: str) -> None:
     contents = set()
     for name in ("a", "b"):
@@ -119,7 +126,7 @@ def test_same_picture_same_bytes(tmp_path: Path, make_picture: Any, extension: s
     assert len(contents) == 1
 
 
-@pytest.mark.parametrize("extension", [".png", ".tif", ".webp", ".jpg", ".bmp"])
+@pytest.mark.parametrize("extension", [".png", ".tif", ".webp", ".jpg", ".bmp", ".avif", ".jp2", ".jxl"])
 def test_views_are_written_as_they_look(tmp_path: Path, extension: str) -> None:
     pixels = np.zeros((24, 40, 3), np.uint8)
     pixels[:, :16] = 255
@@ -137,33 +144,39 @@ def test_one_channel_is_grey(tmp_path: Path, make_picture: Any) -> None:
 
 @pytest.mark.parametrize("extension", [".jpg", ".webp", ".bmp"])
 def test_depth_is_not_lost(tmp_path: Path, make_picture: Any, extension: str) -> None:
-    assert "uint16 pixels; PNG or TIFF can" in refusal(tmp_path / f"a{extension}", make_picture(np.uint16))
-    assert "float32 pixels; TIFF can" in refusal(tmp_path / f"a{extension}", make_picture(np.float32))
+    assert "uint16 pixels; PNG or TIFF or JPEG 2000 or JPEG XL can" in refusal(
+        tmp_path / f"a{extension}", make_picture(np.uint16)
+    )
+    assert "float32 pixels; TIFF or JPEG XL can" in refusal(tmp_path / f"a{extension}", make_picture(np.float32))
     assert not list(tmp_path.iterdir())
 
 
 def test_float_is_not_lost_in_png(tmp_path: Path, make_picture: Any) -> None:
-    assert "float32 pixels; TIFF can" in refusal(tmp_path / "a.png", make_picture(np.float32))
+    assert "float32 pixels; TIFF or JPEG XL can" in refusal(tmp_path / "a.png", make_picture(np.float32))
 
 
 @pytest.mark.parametrize("extension", [".jpg", ".bmp"])
 @pytest.mark.parametrize("channels", [2, 4])
 def test_alpha_is_not_lost(tmp_path: Path, make_picture: Any, extension: str, channels: int) -> None:
     message = refusal(tmp_path / f"a{extension}", make_picture(channels=channels))
-    assert "with alpha; PNG or TIFF or WebP can" in message
+    assert "with alpha; PNG or TIFF or WebP or AVIF or JPEG 2000 or JPEG XL can" in message
 
 
 def test_sides_that_a_format_cannot_count(tmp_path: Path) -> None:
-    assert "70000 x 1 uint8 pixels; PNG or TIFF or BMP can" in refusal(tmp_path / "a.jpg", np.zeros((1, 70_000), "u1"))
+    assert "70000 x 1 uint8 pixels; PNG or TIFF or BMP or" in refusal(
+        tmp_path / "a.jpg", np.zeros((1, 70_000), "u1")
+    )
     for extension, w in ((".webp", 16_383), (".jpg", 65_500)):
         write_picture(tmp_path / f"a{extension}", np.zeros((1, w), np.uint8))
         assert read_picture(tmp_path / f"a{extension}").pixels.shape[:2] == (1, w)
 
 
-@pytest.mark.parametrize("name", ["a", "a.gif", "a.avif", "a.jpg.bak"])
+@pytest.mark.parametrize("name", ["a", "a.gif", "a.heic", "a.jpg.bak"])
 def test_unknown_extension(tmp_path: Path, make_picture: Any, name: str) -> None:
     message = refusal(tmp_path / name, make_picture())
-    assert "has an extension that autoalign does not write (.jpg, .jpeg, .png, .tif, .tiff, .webp, .bmp)" in message
+    assert (
+        "has an extension that autoalign does not write (.jpg, .jpeg, .png, .tif, .tiff, .webp, .bmp" in message
+    )
 
 
 def test_extensions_in_capitals(tmp_path: Path, make_picture: Any) -> None:
@@ -284,7 +297,10 @@ def test_check_writable_leaves_nothing(tmp_path: Path) -> None:
     [
         ("some/scan.JPG", np.uint8, 3, "some/scan_aligned.JPG"),
         ("scan.v2.tiff", np.float32, 3, "scan.v2_aligned.tiff"),
-        ("scan.avif", np.uint8, 3, "scan_aligned.png"),
+        ("scan.avif", np.uint8, 3, "scan_aligned.avif"),
+        ("scan.avif", np.uint16, 3, "scan_aligned.png"),
+        ("scan.heic", np.uint8, 3, "scan_aligned.png"),
+        ("scan.nef", np.uint16, 3, "scan_aligned.tif"),
         ("scan", np.uint8, 3, "scan_aligned.png"),
         ("scan.jpg", np.uint16, 3, "scan_aligned.png"),
         ("scan.jpg", np.uint8, 4, "scan_aligned.png"),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from autoalign.files.metadata import Metadata
 from autoalign.picture.pixels import Picture
 
@@ -34,6 +36,14 @@ class Decoder:
 
 Encoder = Callable[[Picture, Metadata], bytes]
 """Pixels that the format holds, and what is to travel with them, to the bytes of a file: the same bytes every time."""
+
+
+def full_range(pixels: Picture, bits: int) -> Picture:
+    """Whole numbers of this many bits stretched to all that their dtype has; what fills it comes back as it is."""
+    top, stored_top = int(np.iinfo(pixels.dtype).max), 2**bits - 1
+    if stored_top >= top:
+        return pixels
+    return np.asarray((pixels.astype(np.uint32) * top + stored_top // 2) // stored_top, dtype=pixels.dtype)
 
 
 def one_line(error: BaseException) -> str:

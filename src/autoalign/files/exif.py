@@ -144,7 +144,7 @@ def directory_of(block: bytes | None) -> Directory:
     """The main directory of an EXIF block; empty if there is none or it makes no sense."""
     try:
         order = byte_order(block or b"")
-        (start,) = struct.unpack_from(order + "I", block or b"", 4)
+        start = _pointer(block or b"", 4, order)
     except struct.error:
         return {}
     return read_directory(block or b"", start, Layout(order=order))
@@ -198,12 +198,11 @@ def with_resolution(exif: bytes | None, dpi: tuple[float, float] | None) -> byte
     return block_of(tags, ">" if exif and exif.startswith(b"MM") else "<")
 
 
-def entry_places(data: bytes, at: int, layout: Layout) -> tuple[dict[int, int], int]:
-    """Where the entry of each tag stands in the directory that the pointer at `at` names, and where its link stands.
+def entry_places(data: bytes, start: int, layout: Layout) -> tuple[dict[int, int], int]:
+    """Where the entry of each tag stands in the directory that stands at `start`, and where its link stands.
 
     Raises struct.error if the directory does not lie in `data`.
     """
-    (start,) = struct.unpack_from(layout.offset, data, at)
     (count,) = struct.unpack_from(layout.count, data, start)
     start += struct.calcsize(layout.count)
     end = start + layout.entry_size * count
@@ -222,8 +221,9 @@ def describing_exif(exif: bytes, size: tuple[int, int], dpi: tuple[float, float]
     try:
         order = byte_order(exif)
         layout = Layout(order=order)
-        main, link = entry_places(exif, 4, layout)
-        detail = entry_places(exif, main[EXIF_IFD] + 8, layout)[0] if EXIF_IFD in main else {}
+        main, link = entry_places(exif, _pointer(exif, 4, order), layout)
+        inner = EXIF_IFD in main
+        detail = entry_places(exif, _pointer(exif, main[EXIF_IFD] + 8, order), layout)[0] if inner else {}
     except struct.error:
         return exif
     if ORIENTATION in main:
@@ -237,6 +237,11 @@ def describing_exif(exif: bytes, size: tuple[int, int], dpi: tuple[float, float]
     if link + 4 <= len(block):
         struct.pack_into(order + "I", block, link, 0)
     return bytes(block)
+
+
+def _pointer(block: bytes, at: int, order: Order) -> int:
+    (start,) = struct.unpack_from(order + "I", block, at)
+    return int(start)
 
 
 def _put_resolution(block: bytearray, order: str, main: dict[int, int], dpi: tuple[float, float]) -> None:

@@ -19,95 +19,152 @@ HEAD_BYTES = 64  # enough for every mark below
 
 @dataclass(frozen=True, kw_only=True)
 class Format:
-    """One file format. `depths` are the dtypes that autoalign can write in it; empty where it can only read it."""
+    """One file format, and what autoalign can do with it."""
 
     name: str
     mark: bytes  # regular expression for the first bytes
     extensions: tuple[str, ...]
-    depths: tuple[type, ...]
-    alpha: bool
-    max_side: int  # pixels
+    reads: tuple[type, ...]
+    depths: tuple[type, ...] = ()  # the dtypes that can be written; empty where it can only be read
+    lossy: bool = False  # what is written is a little different from what went in
+    alpha: bool = True
+    grey: bool = True  # False: what is written grey comes back as RGB
+    kept: tuple[str, ...]  # of what travels with a picture
+    max_side: int = 2**31 - 1  # pixels
+    extra: str | None = None  # what must be installed on top to read it
+    named: bool = False  # the first bytes are not its own, so that the extension must be one of these
 
     def holds(self, pixels: Picture) -> bool:
-        """True if the pixels can be written in this format with nothing lost but, for JPEG, what compression costs."""
+        """True if the pixels can be written in this format with nothing lost but what lossy compression costs."""
         return (
             pixels.dtype in self.depths
             and (self.alpha or not has_alpha(pixels))
             and max(pixels.shape[:2]) <= self.max_side
         )
 
+    def is_of(self, head: bytes, path: Path | None) -> bool:
+        """True for a file with these first bytes, and this name where that has a say."""
+        named = not self.named or (path is not None and path.suffix.lower() in self.extensions)
+        return named and re.match(self.mark, head, re.DOTALL) is not None
 
-ENDLESS = 2**31 - 1
+
+EXIF, XMP, ICC, RESOLUTION = "EXIF", "XMP", "ICC", "resolution"
 JPEG = Format(
     name="JPEG",
     mark=rb"\xff\xd8\xff",
     extensions=(".jpg", ".jpeg"),
+    reads=(np.uint8,),
     depths=(np.uint8,),
+    lossy=True,
     alpha=False,
+    kept=(EXIF, XMP, ICC, RESOLUTION),
     max_side=65_500,
 )
 PNG = Format(
     name="PNG",
     mark=rb"\x89PNG\r\n\x1a\n",
     extensions=(".png",),
+    reads=(np.uint8, np.uint16),
     depths=(np.uint8, np.uint16),
-    alpha=True,
+    kept=(EXIF, XMP, ICC, RESOLUTION),
     max_side=1_000_000,
 )
 TIFF = Format(
     name="TIFF",
     mark=rb"II[*+]\0|MM\0[*+]",
     extensions=(".tif", ".tiff"),
+    reads=(np.uint8, np.uint16, np.float32),
     depths=(np.uint8, np.uint16, np.float32),
-    alpha=True,
-    max_side=ENDLESS,
+    kept=(EXIF, XMP, ICC, RESOLUTION, "GeoTIFF", "OME-XML", "ImageJ"),
 )
 WEBP = Format(
     name="WebP",
     mark=rb"RIFF.{4}WEBP",
     extensions=(".webp",),
+    reads=(np.uint8,),
     depths=(np.uint8,),
-    alpha=True,
+    grey=False,
+    kept=(EXIF, XMP, ICC, RESOLUTION),
     max_side=16_383,
 )
 BMP = Format(
     name="BMP",
     mark=rb"BM.{12}[\x0c\x28\x34\x38\x40\x6c\x7c]\0\0\0",  # "BM" begins many a text, the lengths of headers do not
     extensions=(".bmp",),
+    reads=(np.uint8,),
     depths=(np.uint8,),
     alpha=False,
-    max_side=ENDLESS,
+    kept=(RESOLUTION,),
 )
 AVIF = Format(
     name="AVIF",
     mark=rb".{4}ftyp(?:.{4})*?avi[fs]",
     extensions=(".avif",),
-    depths=(),
-    alpha=True,
-    max_side=65_536,
+    reads=(np.uint8, np.uint16),
+    depths=(np.uint8,),
+    lossy=True,
+    grey=False,
+    kept=(EXIF, XMP, ICC, RESOLUTION),
+    max_side=16_384,
 )
-FORMATS = (JPEG, PNG, TIFF, WEBP, BMP, AVIF)
+JPEG_2000 = Format(
+    name="JPEG 2000",
+    mark=rb"\0\0\0\x0cjP  \r\n\x87\n|\xff\x4f\xff\x51",
+    extensions=(".jp2",),
+    reads=(np.uint8, np.uint16),
+    depths=(np.uint8, np.uint16),
+    kept=(EXIF, XMP, ICC, RESOLUTION),
+)
+JPEG_XL = Format(
+    name="JPEG XL",
+    mark=rb"\0\0\0\x0cJXL \r\n\x87\n|\xff\x0a",
+    extensions=(".jxl",),
+    reads=(np.uint8, np.uint16, np.float32),
+    depths=(np.uint8, np.uint16, np.float32),
+    kept=(EXIF, XMP, RESOLUTION),
+    max_side=2**30,
+)
+HEIC = Format(
+    name="HEIC",
+    mark=rb".{4}ftyp(?:hei|hev|mif1|msf1)",
+    extensions=(".heic", ".heif"),
+    reads=(np.uint8, np.uint16),
+    kept=(EXIF, XMP, ICC, RESOLUTION),
+    extra="heic",
+)
+RAW = Format(
+    name="raw",
+    mark=rb"II[*]\0|MM\0[*]|IIRO|IIU\0|FUJIFILMCCD-RAW|.{4}ftypcrx",
+    extensions=(".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"),
+    reads=(np.uint16,),
+    alpha=False,
+    kept=(EXIF,),
+    extra="raw",
+    named=True,
+)
+FORMATS = (JPEG, PNG, RAW, TIFF, WEBP, BMP, AVIF, JPEG_2000, JPEG_XL, HEIC)
+"""In the order in which they are tried: what goes by its name comes before what it looks like."""
 
 STRANGERS = {
     "GIF": rb"GIF8",
-    "HEIC": rb".{4}ftyp(?:hei|hev|mif1|msf1)",
-    "JPEG 2000": rb".{4}jP  |\xff\x4f\xff\x51",
-    "JPEG XL": rb".{4}JXL |\xff\x0a",
-    "OpenEXR": rb"\x76\x2f\x31\x01",
+    "OpenEXR": rb"\x76\x2f\x31\x01",  # half floats, layers and linear light: float TIFF holds what is needed of it
     "Photoshop": rb"8BPS",
     "PDF": rb"%PDF",
 }
 """Pictures that are recognised only to be refused by name."""
 
 
-def of_bytes(head: bytes) -> Format:
-    """The format that a file's first `HEAD_BYTES` bytes are in; `Refused` if autoalign does not read it."""
+def of_bytes(head: bytes, path: Path | None = None) -> Format:
+    """The format that a file of these first `HEAD_BYTES` bytes is in; `Refused` if autoalign does not read it.
+
+    `path` says so for raw files of cameras, many of which begin as a TIFF does.
+    """
     for format in FORMATS:
-        if re.match(format.mark, head, re.DOTALL):
+        if format.is_of(head, path):
             return format
     for name, mark in STRANGERS.items():
         if re.match(mark, head, re.DOTALL):
-            raise Refused(f"is a {name} file, which autoalign does not read")
+            raise Refused(f"is in the format {name}, which autoalign does not read")
     raise Refused(f"is not a picture in a format that autoalign reads ({', '.join(f.name for f in FORMATS)})")
 
 
@@ -118,39 +175,101 @@ def of_name(path: Path) -> Format | None:
 
 def decoder_for(format: Format, page: int) -> Decoder:
     """What reads this format; `Refused` for a page other than 0 of a format that has but one."""
-    if format is TIFF:
-        from autoalign.files import tiff
-
-        return tiff.decoder(page)
-    if page != 0:
+    if page != 0 and format is not TIFF:
         raise Refused(f"is a {format.name} file, which has no page {page} (pages count from 0)")
-    if format is JPEG:
-        from autoalign.files import jpeg
+    match format.name:
+        case "TIFF":
+            from autoalign.files import tiff
 
-        return jpeg.decoder()
-    if format is PNG:
-        from autoalign.files import png
+            return tiff.decoder(page)
+        case "JPEG":
+            from autoalign.files import jpeg
 
-        return png.decoder()
-    from autoalign.files import pillow
+            return jpeg.decoder()
+        case "PNG":
+            from autoalign.files import png
 
-    return {WEBP: pillow.webp_decoder, BMP: pillow.bmp_decoder, AVIF: pillow.avif_decoder}[format]()
+            return png.decoder()
+        case "WebP" | "BMP":
+            from autoalign.files import pillow
+
+            return pillow.webp_decoder() if format is WEBP else pillow.bmp_decoder()
+        case "AVIF":
+            from autoalign.files import avif
+
+            return avif.decoder()
+        case "JPEG 2000":
+            from autoalign.files import jpeg2000
+
+            return jpeg2000.decoder()
+        case "JPEG XL":
+            from autoalign.files import jpegxl
+
+            return jpegxl.decoder()
+        case "HEIC":
+            from autoalign.files import heic
+
+            return heic.decoder()
+        case _:
+            from autoalign.files import raw
+
+            return raw.decoder()
 
 
 def encoder_for(format: Format, jpeg_quality: int) -> Encoder:
     """What writes this format, which must be one that has `depths`."""
-    if format is TIFF:
-        from autoalign.files import tiff
+    match format.name:
+        case "TIFF":
+            from autoalign.files import tiff
 
-        return tiff.encoder()
-    if format is JPEG:
-        from autoalign.files import jpeg
+            return tiff.encoder()
+        case "JPEG":
+            from autoalign.files import jpeg
 
-        return jpeg.encoder(jpeg_quality)
-    if format is PNG:
-        from autoalign.files import png
+            return jpeg.encoder(jpeg_quality)
+        case "PNG":
+            from autoalign.files import png
 
-        return png.encoder()
-    from autoalign.files import pillow
+            return png.encoder()
+        case "AVIF":
+            from autoalign.files import avif
 
-    return {WEBP: pillow.webp_encoder, BMP: pillow.bmp_encoder}[format]()
+            return avif.encoder()
+        case "JPEG 2000":
+            from autoalign.files import jpeg2000
+
+            return jpeg2000.encoder()
+        case "JPEG XL":
+            from autoalign.files import jpegxl
+
+            return jpegxl.encoder()
+        case _:
+            from autoalign.files import pillow
+
+            return pillow.webp_encoder() if format is WEBP else pillow.bmp_encoder()
+
+
+def table() -> str:
+    """What can be read, written and kept, as a table for people."""
+    lines = ["| format | extensions | read | written | alpha | kept |", "|---|---|---|---|---|---|"]
+    for format in sorted(FORMATS, key=lambda format: (not format.depths, format.extra or "")):
+        extensions = " ".join(f"`{extension}`" for extension in format.extensions)
+        read = _words(format.reads) + (f", with `autoalign[{format.extra}]`" if format.extra else "")
+        written = _words(format.depths) if format.depths else f"no: {default_for(format).extensions[0]} instead"
+        remarks = [word for word, said in (("lossy", format.lossy), ("grey as RGB", not format.grey)) if said]
+        written += f" ({', '.join(remarks)})" if format.depths and remarks else ""
+        kept = ", ".join(format.kept)
+        lines.append(
+            f"| {format.name} | {extensions} | {read} | {written} | {'yes' if format.alpha else 'no'} | {kept} |"
+        )
+    return "\n".join(lines)
+
+
+def default_for(format: Format | None, pixels: Picture | None = None) -> Format:
+    """The format in which a picture is written whose own cannot be, or cannot hold these pixels."""
+    return TIFF if format is RAW or (pixels is not None and not PNG.holds(pixels)) else PNG
+
+
+def _words(depths: tuple[type, ...]) -> str:
+    words: dict[type, str] = {np.uint8: "8", np.uint16: "16", np.float32: "float"}
+    return ", ".join(words[depth] for depth in depths)

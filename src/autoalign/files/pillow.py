@@ -1,4 +1,4 @@
-"""The formats that Pillow reads and writes for us: WebP, BMP, and AVIF to read only.
+"""The formats that Pillow reads and writes for us: WebP, BMP, and what stands around the pixels of AVIF.
 
 The classes of the formats are called directly, not through `PIL.Image.open`: they read the header alone, and neither
 warn nor refuse by a limit that is global to the process. The size is checked by our own limit.
@@ -35,13 +35,6 @@ def bmp_decoder() -> Decoder:
     return _decoder(BmpImageFile)
 
 
-def avif_decoder() -> Decoder:
-    """Grey or RGB, with or without alpha, uint8 (10 and 12 bits are reduced by Pillow); the first of a sequence."""
-    from PIL.AvifImagePlugin import AvifImageFile
-
-    return _decoder(AvifImageFile)
-
-
 def webp_encoder() -> Encoder:
     """Lossless: grey (which becomes RGB, WebP knows no other) or RGB, uint8, with or without alpha."""
 
@@ -53,7 +46,7 @@ def webp_encoder() -> Encoder:
         }
         present = {name: block for name, block in blocks.items() if block}
         # Exact: the colour under full transparency stays too.
-        return _saved(pixels, "WEBP", lossless=True, exact=True, **present)
+        return saved(pixels, "WEBP", lossless=True, exact=True, **present)
 
     return encode
 
@@ -62,25 +55,24 @@ def bmp_encoder() -> Encoder:
     """Grey or RGB, uint8."""
 
     def encode(pixels: Picture, metadata: Metadata) -> bytes:
-        return _saved(pixels, "BMP", dpi=metadata.dpi or (0, 0))
+        return saved(pixels, "BMP", dpi=metadata.dpi or (0, 0))
 
     return encode
+
+
+def avif_header(data: bytes) -> Header:
+    """Of AVIF; the turns that its boxes ask for are among the orientations of EXIF."""
+    from PIL.AvifImagePlugin import AvifImageFile
+
+    return _header(AvifImageFile(io.BytesIO(data)))
 
 
 def _decoder(opened: Callable[[io.BytesIO], ImageFile]) -> Decoder:
     def read_header(data: bytes) -> Header:
         try:
-            image = opened(io.BytesIO(data))
+            return _header(opened(io.BytesIO(data)))
         except Image.DecompressionBombError:  # of WebP, whose reader allocates on opening
             raise Refused("is larger than the 178 megapixels that are read of this format") from None
-        info = image.info
-        metadata = Metadata(
-            icc=info.get("icc_profile") or None,
-            exif=without_prefix(info.get("exif")),
-            xmp=info.get("xmp") or None,
-            dpi=resolution(*info.get("dpi", (0, 0))),
-        )
-        return Header(size=image.size, orientation=exif_orientation(metadata.exif), metadata=metadata)
 
     def decode(data: bytes) -> Picture:
         image = opened(io.BytesIO(data))
@@ -89,7 +81,19 @@ def _decoder(opened: Callable[[io.BytesIO], ImageFile]) -> Decoder:
     return Decoder(read_header=read_header, decode=decode)
 
 
-def _saved(pixels: Picture, name: str, **options: object) -> bytes:
+def _header(image: ImageFile) -> Header:
+    info = image.info
+    metadata = Metadata(
+        icc=info.get("icc_profile") or None,
+        exif=without_prefix(info.get("exif")),
+        xmp=info.get("xmp") or None,
+        dpi=resolution(*info.get("dpi", (0, 0))),
+    )
+    return Header(size=image.size, orientation=exif_orientation(metadata.exif), metadata=metadata)
+
+
+def saved(pixels: Picture, name: str, **options: object) -> bytes:
+    """The bytes of a file in the format that Pillow calls `name`."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, name, **options)
     return stream.getvalue()

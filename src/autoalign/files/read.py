@@ -34,14 +34,14 @@ class LoadedPicture:
 
 
 def read_picture(path: str | Path, *, max_pixels: float = 300e6, page: int = 0) -> LoadedPicture:
-    """Read a picture: JPEG, PNG, TIFF, WebP, BMP or AVIF; uint8, uint16 or float32 as the file has it.
+    """Read a picture in any of the `FORMATS`; uint8, uint16 or float32 as the file has it.
 
     The EXIF orientation is applied to the pixels. `page`, from 0, selects one of a TIFF. Raises ImageReadError, one
     line with the path last, if there is no such file, it is no picture, more than `max_pixels` pixels large (found
     from the header, before anything is decoded), damaged, or of a kind that autoalign does not take.
     """
     path = Path(path)
-    with _opened(path) as file:
+    with opened(path) as file:
         format = _format(file.read(HEAD_BYTES), path)
         file.seek(0)
         data = file.read()
@@ -60,7 +60,7 @@ def read_text(path: Path, *, max_bytes: int) -> str:
 
     Raises ImageReadError if it cannot be read, is larger than `max_bytes` or no UTF-8.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise ImageReadError(f"is larger than the {max_bytes:,} bytes allowed: {path}")
@@ -82,7 +82,7 @@ def upright(pixels: Picture, orientation: int) -> Picture:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
+def opened(path: Path) -> Iterator[BinaryIO]:
     """The file open for reading; every reason why it cannot be as an ImageReadError."""
     try:
         mode = path.stat().st_mode
@@ -104,7 +104,7 @@ def _format(head: bytes, path: Path) -> Format:
     if not head:
         raise ImageReadError(f"is empty: {path}")
     try:
-        return of_bytes(head)
+        return of_bytes(head, path)
     except Refused as refusal:
         raise ImageReadError(f"{refusal}: {path}") from None
 
@@ -114,7 +114,7 @@ def _decoded(data: bytes, format: Format, page: int, max_pixels: float, path: Pa
     try:
         decoder = decoder_for(format, page)
         header = decoder.read_header(data)
-        _check_size(header.size, max_pixels)
+        check_size(header.size, max_pixels)
         pixels = decoder.decode(data)
         if size_of(pixels) != header.size:
             raise ValueError(f"the header says {header.size}, the pixels are {size_of(pixels)}")
@@ -126,7 +126,8 @@ def _decoded(data: bytes, format: Format, page: int, max_pixels: float, path: Pa
         raise ImageReadError(f"is damaged, or no {format.name} that can be read ({one_line(error)}): {path}") from error
 
 
-def _check_size(size: tuple[int, int], max_pixels: float) -> None:
+def check_size(size: tuple[int, int], max_pixels: float) -> None:
+    """Raise Refused if a picture of `size` (w, h) has no pixels, or more than allowed."""
     w, h = size
     if w < 1 or h < 1:
         raise Refused(f"has no pixels ({w} x {h})")

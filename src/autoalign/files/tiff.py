@@ -59,7 +59,7 @@ def encoder() -> Encoder:
 def _read_header(data: bytes, number: int) -> Header:
     with _page(data, number) as page:
         check_readable(page)
-        orientation = _tag(page, "Orientation", 1)
+        orientation = tag(page, "Orientation", 1)
         return Header(
             size=(page.imagewidth, page.imagelength),
             orientation=orientation if orientation in range(1, 9) else 1,
@@ -134,7 +134,8 @@ def _page(data: bytes, number: int) -> Iterator[Any]:
         yield page
 
 
-def _tag(page: Any, name: str, default: Any) -> Any:
+def tag(page: Any, name: str, default: Any) -> Any:
+    """The value of a tag, or what is to be taken where the page has none."""
     return page.tags[name].value if name in page.tags else default
 
 
@@ -199,7 +200,7 @@ def read_metadata(data: bytes, page: Any, number: int) -> Metadata:
     scope = microscope.of_plane(written, number) if microscope.is_known(written) else None
     if scope or microscope.is_known(page.description) or page.is_shaped:
         directory.pop(exif.DESCRIPTION, None)
-    x, y = (_tag(page, name, (0, 1)) for name in ("XResolution", "YResolution"))
+    x, y = (tag(page, name, (0, 1)) for name in ("XResolution", "YResolution"))
     ratio = resolution(x[0] / x[1], y[0] / y[1]) if x[1] and y[1] else None
     dpi = exif.exif_dpi(directory)
     xmp, no_data = directory.get(XMP), directory.get(NO_DATA)
@@ -253,10 +254,13 @@ def append_directories(stream: IO[bytes], metadata: Metadata, layout: exif.Layou
     inner = {code: item for code, item in found.items() if code in PLACEHOLDERS and not isinstance(item, exif.Tag)}
     if not inner:
         return
-    places, _ = exif.entry_places(stream.getvalue(), 8 if layout.big else 4, layout)
+    stream.seek(8 if layout.big else 4)
+    (start,) = struct.unpack(layout.offset, stream.read(struct.calcsize(layout.offset)))
+    stream.seek(start)
+    places, _ = exif.entry_places(stream.read(layout.entry_size * exif.MAX_TAGS), 0, layout)
     for code, item in inner.items():
         at = stream.seek(0, io.SEEK_END)
         at += stream.write(bytes(at % 2))  # directories begin at even places
         stream.write(exif.pack_directory(item, layout, at))
-        stream.seek(places[code] + layout.entry_size - struct.calcsize(layout.offset))
+        stream.seek(start + places[code] + layout.entry_size - struct.calcsize(layout.offset))
         stream.write(struct.pack(layout.offset, at))
