@@ -39,6 +39,17 @@ def show_worst(page: Page) -> None:
     page.locator("[data-show]").click()
 
 
+def slide_by_keyboard(page: Page) -> None:
+    show_worst(page)
+    for _ in range(25):
+        page.locator("input[type=range]").press("ArrowRight")
+
+
+def blink(page: Page) -> None:
+    show_worst(page)
+    page.locator("button.blink").click()
+
+
 def search_by_keyboard(page: Page) -> None:
     page.locator("#search").press_sequentially("a")
     page.keyboard.press("Tab")
@@ -49,6 +60,8 @@ LOOKS: tuple[Look, ...] = (
     ("dark", WIDE, "dark", lambda page: None),
     ("dark_open", WIDE, "dark", open_first),
     ("light_worst", WIDE, "light", show_worst),
+    ("dark_slid", WIDE, "dark", slide_by_keyboard),
+    ("light_blinking", WIDE, "light", blink),
     ("light_sorted", WIDE, "light", sort_by_error),
     ("dark_rejected", WIDE, "dark", only_rejected),
     ("light_search", WIDE, "light", search_by_keyboard),

@@ -20,8 +20,8 @@ from autoalign.views.words import number
 
 Name = TypeVar("Name", bound=str)  # the class of a page
 
-WIDTH, HEIGHT = 420, 150  # units of a chart; at about 1 px each, as on a phone, its letters are legible
-LEFT, RIGHT, TOP, BOTTOM = 44, 410, 12, 128  # of what is plotted in it
+WIDTH, HEIGHT = 360, 150  # units of a chart; at about 1 px each, as on a phone, its letters are legible
+LEFT, RIGHT, TOP, BOTTOM = 44, 342, 12, 128  # of what is plotted in it
 BINS_PER_DECADE = 6
 SHOWN = (1e-4, 1e4)  # values beyond are counted as these
 

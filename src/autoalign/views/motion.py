@@ -26,12 +26,12 @@ def motion(fixed_from_moving: ArrayLike, moving_size: tuple[int, int]) -> Motion
     transform = np.asarray(fixed_from_moving, np.float64)
     middle = (np.array([moving_size], np.float64) - 1) / 2
     landed, _ = project(transform, middle)
-    slope = jacobian(transform, middle)[0]
-    determinant = float(np.linalg.det(slope))
+    (a, b), (c, d) = jacobian(transform, middle)[0].tolist()
+    determinant = a * d - b * c
     x, y = (landed - middle)[0].tolist()
     return Motion(
         shift_px=(x, y),
-        turn_rad=math.atan2(slope[1, 0] - slope[0, 1], slope[0, 0] + slope[1, 1]),
+        turn_rad=math.atan2(c - b, a + d),
         scale=math.sqrt(abs(determinant)),
         mirrored=determinant < 0,
     )

@@ -140,7 +140,7 @@ def _motion(row: Row) -> Motion | None:
 def _summary(tally: _Tally, about: Mapping[str, str], sequence: bool) -> dict[str, str]:
     """What stands above the table."""
     total = sum(tally.counts.values())
-    cards = [_errors_card(tally), _drift_card(tally.motions) if sequence else "", _about_card(about)]
+    cards = [_errors_card(tally), _about_card(about), _drift_card(tally.motions) if sequence else ""]
     return {
         "subtitle": f"{total:,} {'pair' if total == 1 else 'pairs'} · autoalign {__version__}",
         "bar": shares(tally.counts),
@@ -187,8 +187,10 @@ def _drift_card(motions: list[Motion | None]) -> str:
         "scale": {"scale": line(lambda by: by.scale)},
     }
     charts = [(words, over_frames(each, f"{words}, of every frame")) for words, each in lines.items()]
-    drawn = "".join(f'<p class="faint">{words}</p>{chart}' for words, chart in charts if chart)
-    return f'<div class="card" data-sequence><h2>Drift over the frames</h2>{drawn}</div>'
+    drawn = "".join(f'<div><p class="faint">{words}</p>{chart}</div>' for words, chart in charts if chart)
+    return (
+        f'<div class="card whole" data-sequence><h2>Drift over the frames</h2><div class="charts">{drawn}</div></div>'
+    )
 
 
 def _about_card(about: Mapping[str, str]) -> str:
