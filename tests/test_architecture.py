@@ -36,6 +36,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "features",
             "matching",
             "ladder",
+            "patches",
             "refine",
             "agreement",
             "verdict",
@@ -68,6 +69,8 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "formats",
             "read",
             "write",
+            "tiled",
+            "pyramid",
             "points",
             "sized",
             "feature_store",
@@ -108,6 +111,7 @@ HOMES: dict[str, tuple[str, ...]] = {
         "picture.compose",
         "registration.simulate",
         "registration.features",
+        "registration.patches",
         "registration.refine",
         "registration.agreement",
         "files.feature_store",  # its version only
@@ -135,7 +139,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "simplejpeg": ("files.jpeg",),
     "skimage": ("registration.alignment",),  # its ProjectiveTransform, for those who live there
     "threadpoolctl": ("batch.slot",),
-    "tifffile": ("files.tiff",),
+    "tifffile": ("files.tiff", "files.tiled", "files.pyramid"),
 }
 
 NOT_LOADED_BY_IMPORT = ("rerun", "typer", "cyclopts", "rich", "fastapi", "dask", "cv2", "skimage", "numpy")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -16,8 +16,8 @@ from typing import BinaryIO
 import numpy as np
 
 from autoalign.errors import ImageReadError
-from autoalign.files.codec import Header, Refused, one_line
-from autoalign.files.formats import HEAD_BYTES, Format, decoder_for, of_bytes
+from autoalign.files.codec import Decoder, Header, Refused, one_line
+from autoalign.files.formats import HEAD_BYTES, LENIENT, Format, decoder_for, of_bytes
 from autoalign.files.metadata import Metadata, describing, turned
 from autoalign.picture.pixels import Picture, size_of
 
@@ -31,27 +31,42 @@ class LoadedPicture:
     sha256: str  # of the file's bytes, 64 hexadecimal digits
     format: str  # "JPEG", "PNG", ...: what the bytes are, whatever the extension says
     path: Path
+    remark: str | None = None  # what had to be overlooked to read it, a sentence
 
 
-def read_picture(path: str | Path, *, max_pixels: float = 300e6, page: int = 0) -> LoadedPicture:
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """What is taken of a file."""
+
+    max_pixels: float | None = None
+    """pixels that a picture may have; by default 300 million, or 2^30 where a TIFF can be read by its tiles"""
+    lenient: bool = False
+    """take what can be had of a damaged JPEG, PNG, TIFF or BMP, and say so; by default it is refused"""
+
+
+MAX_PIXELS = 300e6
+
+
+def read_picture(path: str | Path, options: ReadOptions = ReadOptions(), *, page: int = 0) -> LoadedPicture:
     """Read a picture in any of the `FORMATS`; uint8, uint16 or float32 as the file has it.
 
     The EXIF orientation is applied to the pixels. `page`, from 0, selects one of a TIFF. Raises ImageReadError, one
-    line with the path last, if there is no such file, it is no picture, more than `max_pixels` pixels large (found
-    from the header, before anything is decoded), damaged, or of a kind that autoalign does not take.
+    line with the path last, if there is no such file, it is no picture, has more pixels than are allowed (found from
+    the header, before anything is decoded), is damaged, or of a kind that autoalign does not take.
     """
     path = Path(path)
     with opened(path) as file:
         format = _format(file.read(HEAD_BYTES), path)
         file.seek(0)
         data = file.read()
-    header, pixels = _decoded(data, format, page, max_pixels, path)
+    header, pixels, remark = _decoded(data, format, page, options, path)
     return LoadedPicture(
         pixels=pixels,
         metadata=describing(turned(header.metadata, header.orientation), pixels),
         sha256=hashlib.sha256(data).hexdigest(),
         format=format.name,
         path=path,
+        remark=remark,
     )
 
 
@@ -109,21 +124,31 @@ def _format(head: bytes, path: Path) -> Format:
         raise ImageReadError(f"{refusal}: {path}") from None
 
 
-def _decoded(data: bytes, format: Format, page: int, max_pixels: float, path: Path) -> tuple[Header, Picture]:
-    """The header and the upright pixels; whatever a decoder raises as an ImageReadError."""
+def _decoded(
+    data: bytes, format: Format, page: int, options: ReadOptions, path: Path
+) -> tuple[Header, Picture, str | None]:
+    """The header, the upright pixels and a remark; whatever a decoder raises as an ImageReadError."""
+    max_pixels = options.max_pixels or MAX_PIXELS
     try:
-        decoder = decoder_for(format, page)
-        header = decoder.read_header(data)
-        check_size(header.size, max_pixels)
-        pixels = decoder.decode(data)
-        if size_of(pixels) != header.size:
-            raise ValueError(f"the header says {header.size}, the pixels are {size_of(pixels)}")
-        return header, upright(pixels, header.orientation)
+        return *_decoded_by(decoder_for(format, page), data, max_pixels), None
     except Refused as refusal:
         raise ImageReadError(f"{refusal}: {path}") from refusal
-    except Exception as error:
-        # Decoders raise what they like on damaged bytes: struct, index, zlib, memory, their own.
-        raise ImageReadError(f"is damaged, or no {format.name} that can be read ({one_line(error)}): {path}") from error
+    except Exception as error:  # decoders raise what they like on damaged bytes: struct, index, zlib, memory, their own
+        fault = one_line(error)
+        if options.lenient and format in LENIENT:
+            with suppress(Exception):
+                header, pixels = _decoded_by(decoder_for(format, page, lenient=True), data, max_pixels)
+                return header, pixels, f"is damaged ({fault}), and what could be read of it was taken: {path}"
+        raise ImageReadError(f"is damaged, or no {format.name} that can be read ({fault}): {path}") from error
+
+
+def _decoded_by(decoder: Decoder, data: bytes, max_pixels: float) -> tuple[Header, Picture]:
+    header = decoder.read_header(data)
+    check_size(header.size, max_pixels)
+    pixels = decoder.decode(data)
+    if size_of(pixels) != header.size:
+        raise ValueError(f"the header says {header.size}, the pixels are {size_of(pixels)}")
+    return header, upright(pixels, header.orientation)
 
 
 def check_size(size: tuple[int, int], max_pixels: float) -> None:

@@ -34,6 +34,7 @@ COLOURS = {
 }
 """Samples that make the colour of a pixel, for the kinds of TIFF that are read; the others are refused by name."""
 ALPHAS = (EXTRASAMPLE.UNASSALPHA, EXTRASAMPLE.ASSOCALPHA)
+UNCOMPRESSED = 1
 JPEG_COMPRESSION = 7  # the only one whose YCbCr pixels arrive as RGB
 XMP, ICC = 700, 34675
 PLACEHOLDERS = {exif.EXIF_IFD: "ExifTag", exif.GPS_IFD: "GPSTag"}  # tifffile lets them through by these names only
@@ -46,9 +47,13 @@ for _name in ("tifffile", "imagecodecs"):
     logging.getLogger(_name).addHandler(logging.NullHandler())
 
 
-def decoder(page: int) -> Decoder:
-    """The page, counted from 0: grey, palette or RGB, with or without alpha, uint8, uint16, float32, 1 to 4 bits."""
-    return Decoder(read_header=partial(_read_header, number=page), decode=partial(_decode, number=page))
+def decoder(page: int, lenient: bool = False) -> Decoder:
+    """The page, counted from 0: grey, palette or RGB, with or without alpha, uint8, uint16, float32, 1 to 4 bits.
+
+    `lenient`: strips and tiles that are damaged or missing are 0.
+    """
+    decode = _decode_leniently if lenient else _decode
+    return Decoder(read_header=partial(_read_header, number=page), decode=partial(decode, number=page))
 
 
 def encoder() -> Encoder:
@@ -65,6 +70,25 @@ def _read_header(data: bytes, number: int) -> Header:
             orientation=orientation if orientation in range(1, 9) else 1,
             metadata=read_metadata(data, page, number),
         )
+
+
+def _decode_leniently(data: bytes, number: int) -> Picture:
+    with _page(data, number) as page:
+        pixels = np.zeros(page.shaped, page.dtype)  # (planes, depth, h, w, samples)
+        for index, (offset, count) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=False)):
+            stored = data[offset : offset + count]
+            if page.compression == UNCOMPRESSED:
+                stored = stored.ljust(min(count, pixels.nbytes), b"\0")
+            try:
+                segment, (plane, depth, top, left, _), _ = page.decode(
+                    stored, index, jpegtables=page.jpegtables, jpegheader=page.jpegheader
+                )
+            except Exception:  # decoders raise what they like on damaged bytes; this strip or tile stays 0
+                continue
+            room = pixels[plane, depth:, top:, left:]
+            d, h, w = (min(sides) for sides in zip(segment.shape[:3], room.shape[:3], strict=True))
+            room[:d, :h, :w] = segment[:d, :h, :w]
+        return as_picture(pixels[0, 0] if len(pixels) == 1 else np.concatenate(pixels[:, 0], axis=-1), page)
 
 
 def _decode(data: bytes, number: int) -> Picture:
