@@ -60,7 +60,7 @@ def write_bytes_atomically(path: str | Path, data: bytes, overwrite: bool = Fals
 
 @contextmanager
 def writing_atomically(path: str | Path, overwrite: bool = False) -> Iterator[Callable[[bytes], None]]:
-    """What appends bytes to a file that is at `path`, whole, once the block has ended well; else nothing is left behind.
+    """What appends bytes to a file that is at `path`, whole, once the block has ended well; else nothing is left.
 
     Raises ImageWriteError, the path last, as `write_bytes_atomically` does.
     """
@@ -151,7 +151,7 @@ def _new_file(temporary: Path, path: Path) -> Iterator[BinaryIO]:
     """A file that was not there before; whatever goes wrong with it is said of `path`."""
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)  # the last one on Windows only
     with blaming(path):
-        file = open(temporary, "w+b", opener=lambda name, _: os.open(name, flags, NEW_FILE_MODE))
+        file = open(temporary, "w+b", opener=lambda name, _: os.open(name, flags, NEW_FILE_MODE))  # noqa: SIM115
     try:
         yield file
     finally:
