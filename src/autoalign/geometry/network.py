@@ -32,7 +32,7 @@ _ALONG = _DIRECTIONS / np.square(_DIRECTIONS).sum((1, 2), keepdims=True)
 _MEDIAN_SQUARE = 7.344  # median of a chi-square of eight degrees of freedom
 _SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 _NARROWING = 4.0  # of the loss, per step
-_WIDEST = 4.0**16  # a tie that is further off takes no part from the beginning
+_WIDEST = 4.0**20  # squared misfit; a tie that is further off takes no part from the beginning
 _SAMPLES = 128  # of the error of all frames together: their covariance is known to 12 %, its root to 6 %
 
 
@@ -99,15 +99,15 @@ def adjust_in_simplest(
 ) -> tuple[Model, Adjustment]:
     """The simplest of the models, given from simple to general, in which the ties agree as in the most general one.
 
-    That is the one of least BIC (Schwarz 1978), with the scale of the errors that the most general one shows, among
-    those that overrule no tie that it does not. A model of few parameters leaves less room for the errors of the ties.
+    That is the one of least BIC (Schwarz 1978) among those that overrule no tie that it does not. The scale is that of
+    the errors that the ties claim, or show where these are larger: nothing finer is read out of them.
     """
     general = adjust(models[-1], reference, norm, ties, threshold=threshold)
     best, chosen = np.inf, (models[-1], general)
     for model in models:
         adjusted = general if model is models[-1] else adjust(model, reference, norm, ties, threshold=threshold)
         if (adjusted.kept | ~general.kept).all():
-            squared = 8.0 * (adjusted.misfit[general.kept] / max(general.unit_sigma, 1e-6)) ** 2
+            squared = 8.0 * (adjusted.misfit[general.kept] / max(general.unit_sigma, 1.0)) ** 2
             criterion = squared.sum() + model.degrees_of_freedom * len(norm) * np.log(max(8 * len(squared), 1))
             if criterion < best:
                 best, chosen = criterion, (model, adjusted)
@@ -208,14 +208,12 @@ def _slope(transforms: Array, velocity: Array) -> Array:
 def _graduated(network: _Network, transforms: Array, threshold: float, max_steps: int) -> Array:
     """The transforms of least robust cost: the loss is so wide at first that no tie is left out, and narrows."""
     everyone = network.held(np.ones(len(network.ties), np.bool_))
-    width = np.inf
+    width, narrowest = _WIDEST, _limit(threshold, 1.0)
     for _ in range(max_steps):
         at = _linearise(network, transforms)
-        limit = _limit(threshold, _unit_variance(network, at.squared, len(everyone)))
-        width = min(width / _NARROWING, _WIDEST, 2.0 * float(at.squared.max()) / limit)
-        scale = max(width, 1.0) * limit
-        transforms, moved = _moved(network, transforms, at, (scale / (scale + at.squared)) ** 2, everyone)
-        if width <= 1.0 and moved < 1e-9:
+        width = max(min(width / _NARROWING, 2.0 * float(at.squared.max())), narrowest)
+        transforms, moved = _moved(network, transforms, at, (width / (width + at.squared)) ** 2, everyone)
+        if width == narrowest and moved < 1e-9:
             break
     return transforms
 
@@ -262,9 +260,10 @@ def _moved(network: _Network, transforms: Array, at: _Linearised, weights: Array
         return transforms, 0.0
     slope = _stacked(network, at, weights, held)
     right = slope.T @ (np.sqrt(weights)[:, None] * at.residual).ravel()
-    parameters = np.zeros((len(transforms), network.model.degrees_of_freedom))
-    parameters[held] = -_factored(slope).solve(right).reshape(len(held), -1)
-    return step(network.model, transforms, parameters, network.norm), float(np.abs(parameters).max())
+    parameters = -_factored(slope).solve(right).reshape(len(held), -1)
+    moved = transforms.copy()
+    moved[held] = step(network.model, transforms[held], parameters, network.norm[held])
+    return moved, float(np.abs(parameters).max())
 
 
 def _stacked(network: _Network, at: _Linearised, weights: Array, held: Indices) -> scipy.sparse.csr_array:
