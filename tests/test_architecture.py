@@ -43,8 +43,9 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "alignment",
             "typed",
             "prepared",
-            "mirror",
+            "frames",
             "align",
+            "large",
             "sequence",
             "drawing",
         )
@@ -80,11 +81,12 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "row",
         )
     },
-    {"views": ("motion", "words", "evidence", "pictures", "charts", "report", "viewer", "window")},
+    {"views": ("motion", "words", "evidence", "pictures", "charts", "report", "viewer", "viewer_batch", "window")},
     {
         "batch": (
             "jobs",
             "sources",
+            "arrivals",
             "manifest",
             "memory",
             "work",
@@ -98,7 +100,23 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "telling",
         )
     },
-    {"cli": ("terminal", "settings", "files", "progress", "view", "pair", "rectify", "apply", "batch", "main")},
+    {
+        "cli": (
+            "terminal",
+            "settings",
+            "files",
+            "progress",
+            "running",
+            "view",
+            "pair",
+            "rectify",
+            "apply",
+            "batch",
+            "watch",
+            "status",
+            "main",
+        )
+    },
 )
 
 # Where a package outside the standard library may be imported. NumPy is everywhere.
@@ -125,6 +143,9 @@ HOMES: dict[str, tuple[str, ...]] = {
         "cli.rectify",
         "cli.apply",
         "cli.batch",
+        "cli.running",
+        "cli.watch",
+        "cli.status",
         "cli.view",
         "cli.main",
     ),
@@ -133,12 +154,13 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pillow_heif": ("files.heic",),
     "rawpy": ("files.raw",),
     "psutil": ("batch.slot", "batch.ledger"),
-    "rerun": ("views.viewer",),
+    "rerun": ("views.viewer", "views.viewer_batch"),
     "rich": ("cli.terminal", "cli.progress"),
     "scipy": ("geometry.graph", "geometry.network"),
     "simplejpeg": ("files.jpeg",),
     "skimage": ("registration.alignment",),  # its ProjectiveTransform, for those who live there
     "threadpoolctl": ("batch.slot",),
+    "watchdog": ("batch.arrivals",),
     "tifffile": ("files.tiff", "files.tiled", "files.pyramid"),
 }
 

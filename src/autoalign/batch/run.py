@@ -66,25 +66,37 @@ def by_key(jobs: Sequence[Job], hash_of: Callable[[str], str]) -> dict[str, Job]
     return {key(job, readable(hash_of)): job for job in jobs}
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlanOptions:
+    """What is done again, and what is kept in memory for it."""
+
+    retry: bool = False  # do again what failed
+    overwrite: bool = False  # replace files that are no results of this batch
+    more: bool = False  # the jobs come on top of those that the ledger has
+    again: frozenset[str] | None = None  # inputs whose features are kept; None: those that come in more jobs than one
+
+
 def planned(
-    jobs: Sequence[Job], out_dir: Path, ledger: Ledger, store: Path, *, retry: bool, overwrite: bool, remember_all: bool
+    jobs: Sequence[Job], out_dir: Path, ledger: Ledger, store: Path, options: PlanOptions | None = None
 ) -> Plan:
     """Enter the jobs into the ledger, and find those that it does not know to be done.
 
     A job is done again if its inputs, its options or the version have changed, if its result is no longer there, or,
-    with `retry`, if it failed. `remember_all` keeps the features of pictures that come only once, too. Raises as
-    `by_key` does, and ImageWriteError if a file is in the way that is no result of this batch, unless `overwrite`.
+    with `retry`, if it failed. Raises as `by_key` does, and ImageWriteError if a file is in the way that is no result
+    of this batch, unless `overwrite`.
     """
+    options = options or PlanOptions()
     keyed = by_key(jobs, ledger.hash_of)
-    if not overwrite:
+    if not options.overwrite:
         _check_strangers(jobs, ledger.names())
-    ledger.plan(Entry(key=of, name=job.name, fixed=job.fixed, moving=job.moving) for of, job in keyed.items())
+    entries = (Entry(key=of, name=job.name, fixed=job.fixed, moving=job.moving) for of, job in keyed.items())
+    ledger.plan(entries, more=options.more)
     mine = {job.name for job in jobs}
     rows = [row for row in ledger.rows() if row.name in mine]
-    ledger.reopen(row.name for row in rows if _is_gone(row, out_dir) or (retry and row.status == "failed"))
+    ledger.reopen(row.name for row in rows if _is_gone(row, out_dir) or (options.retry and row.status == "failed"))
     _sweep({job.output.parent for job in jobs})
     uses = Counter(path for job in jobs for path in job.inputs)
-    again = frozenset(path for path, count in uses.items() if count > 1 or remember_all)
+    again = options.again or frozenset(path for path, count in uses.items() if count > 1)
     tasks = tuple(
         Task(job=keyed[of], key=of, store=str(store), again=again.intersection(keyed[of].inputs))
         for of in ledger.pending()

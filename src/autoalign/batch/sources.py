@@ -32,10 +32,15 @@ def pictures(folder: Path, selection: Selection, *, without: Path | None = None)
     A picture is what has the extension of one; hidden files, and the folder `without`, are passed over. Raises
     ValueError if there are none, ImageReadError if the folder cannot be read.
     """
-    found = sorted(_walk(folder, selection, without and without.resolve()), key=natural)
+    found = found_pictures(folder, selection, without=without)
     if not found:
         raise ValueError(f"has no pictures{' that were asked for' if selection != Selection() else ''}: {folder}")
     return found
+
+
+def found_pictures(folder: Path, selection: Selection, *, without: Path | None = None) -> list[str]:
+    """As `pictures`, but there may be none."""
+    return sorted(_walk(folder, selection, without and without.resolve()), key=natural)
 
 
 def natural(text: str) -> list[tuple[int, int | str]]:

@@ -6,25 +6,24 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from cyclopts import Group, Parameter
+from cyclopts import Parameter
 
 from autoalign.batch.chain import link_up, place
-from autoalign.batch.engine import Engine, LocalEngine
+from autoalign.batch.engine import Engine
 from autoalign.batch.jobs import Job, JobOptions, Recorded
 from autoalign.batch.ledger import FILE_NAME as LEDGER
 from autoalign.batch.ledger import Ledger, LedgerReader
 from autoalign.batch.manifest import manifest_jobs
-from autoalign.batch.run import carry_out, feature_store, planned
-from autoalign.batch.slot import Limits
+from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
 from autoalign.batch.sources import Selection, in_groups, onto_reference, pictures, place_of_reference
 from autoalign.batch.telling import write_reports
 from autoalign.cli.progress import clock, following, tally
-from autoalign.cli.terminal import FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
-from autoalign.errors import ImageWriteError
+from autoalign.cli.running import RUNNING, Running, engine_of, in_words, make_folder
+from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
 from autoalign.files.read import read_text
 from autoalign.files.row import Row
 from autoalign.registration.alignment import AlignOptions
@@ -32,7 +31,7 @@ from autoalign.registration.drawing import Drawing
 from autoalign.registration.sequence import SequenceOptions, links
 
 STDIN = Path("-")
-MAX_MANIFEST_BYTES, GB = 1 << 28, 1e9
+MAX_MANIFEST_BYTES = 1 << 28
 TOLD = 10  # pairs that are not aligned, at the end
 
 
@@ -53,8 +52,8 @@ class BatchFiles:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Running:
-    """How the work is gone about."""
+class Again:
+    """What is done, and what is done once more."""
 
     plan: bool = False
     """only say what would be done"""
@@ -62,14 +61,6 @@ class Running:
     """also do again what failed before"""
     fail_fast: bool = False
     """stop at the first pair that fails, as by a file that cannot be read"""
-    workers: int | None = None
-    """pairs at a time; by default as many as there are cores"""
-    cache: Path | None = None
-    """folder to keep the keypoints of all pictures in, for other batches"""
-    kill_after: float = 600.0
-    """seconds after which a pair is given up"""
-    max_memory: float = 8.0
-    """gigabytes of memory at which a pair is given up"""
 
 
 def batch(
@@ -79,8 +70,9 @@ def batch(
     files: Annotated[BatchFiles, Parameter(name="*", group=FILES)],
     selection: Annotated[Selection, Parameter(name="*", group=FILES)] = Selection(),
     drawing: Annotated[Drawing, Parameter(name="*", group=FILES)] = Drawing(),
-    running: Annotated[Running, Parameter(name="*", group=Group("Running", sort_key=1.5))] = Running(),
-    options: Annotated[AlignOptions, Parameter(name="*", group=Group("Alignment", sort_key=2))] = AlignOptions(),
+    again: Annotated[Again, Parameter(name="*", group=RUNNING)] = Again(),
+    running: Annotated[Running, Parameter(name="*", group=RUNNING)] = Running(),
+    options: Annotated[AlignOptions, Parameter(name="*", group=ALIGNMENT)] = AlignOptions(),
     common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
 ) -> int:
     """Plan, do what is not done yet, report.
@@ -93,28 +85,20 @@ def batch(
     started = time.monotonic()
     wanted = JobOptions(align=options, drawing=drawing, recorded=files.save_rrd)
     jobs, reference = _jobs(source, files, selection, wanted)
-    if running.plan:
+    if again.plan:
         return _tell_plan(jobs, reference, files.out_dir)
-    _make(files.out_dir)
+    make_folder(files.out_dir)
     with Ledger(files.out_dir) as ledger, feature_store(files.out_dir, running.cache) as store:
-        engine = LocalEngine(
-            workers=running.workers, limits=Limits(time_s=running.kill_after, memory=round(running.max_memory * GB))
-        )
-        about = {"source": str(source)} | _words(files) | _words(selection) | _words(drawing) | _words(options)
+        engine = engine_of(running)
+        about = {"source": str(source)} | in_words(files, selection, drawing, running, options)
         ledger.begin_run(about)
         if reference is not None:
             jobs = _placed(jobs, reference, ledger, engine, store, common)
-        plan = planned(
-            jobs,
-            files.out_dir,
-            ledger,
-            store,
-            retry=running.retry == "failed",
-            overwrite=common.overwrite,
-            remember_all=running.cache is not None,
-        )
+        everything = frozenset(path for job in jobs for path in job.inputs) if running.cache else None
+        wishes = PlanOptions(retry=again.retry == "failed", overwrite=common.overwrite, again=everything)
+        plan = planned(jobs, files.out_dir, ledger, store, wishes)
         with following("pairs", len(plan.tasks), common.quiet) as follow:
-            for row in carry_out(plan, ledger, engine, fail_fast=running.fail_fast):
+            for row in carry_out(plan, ledger, engine, fail_fast=again.fail_fast):
                 follow(row.status)
         mine = {job.name for job in jobs}
         rows = [row for row in ledger.rows() if row.name in mine]
@@ -172,13 +156,6 @@ def _frame(folder: Path, names: Sequence[str], reference: str) -> int:
     raise ValueError(f"is none of the frames of {folder}: {reference}")
 
 
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ImageWriteError(f"cannot be made a folder for the results ({error.strerror}): {folder}") from None
-
-
 def _tell_plan(jobs: Sequence[Job], reference: int | None, out_dir: Path) -> Exit:
     """A line for each job that would be done, and nothing done."""
     known = {}
@@ -204,15 +181,6 @@ def _placed(
             linked.append(one)
             follow(one.link.status)
     return place(frames, reference, linked, SequenceOptions())
-
-
-def _words(options: Any) -> dict[str, str]:
-    """The options that are not as they are by default, as words."""
-    return {
-        f"--{field.name.replace('_', '-')}": str(value)
-        for field in fields(options)
-        if (value := getattr(options, field.name)) != field.default and not is_dataclass(value)
-    }
 
 
 def _tell_end(rows: Sequence[Row], total: int, plan_done: int, seconds: float, common: Common) -> None:

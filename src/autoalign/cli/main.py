@@ -35,6 +35,14 @@ A pair that is not aligned, or a file that cannot be read, is a line in the repo
 
 Exit code: 0 all aligned, 1 some are not, 2 wrong usage, 3 some could not be read or written.
 """,
+    "watch": """\
+Align pictures onto one reference as they arrive in a folder.
+
+A picture counts as arrived when it was closed, renamed into place, or has not changed for two seconds. What `batch` \
+says of results, records, report and ledger holds here, too: started again, it goes on where it was.
+
+Exit code: 0 all aligned, 1 some are not, 2 wrong usage, 3 the folder or the reference cannot be read.
+""",
     "rectify": """\
 Show a plane in IMAGE upright and to scale, from four or more points on it.
 

@@ -11,10 +11,10 @@ from typing import Annotated
 from cyclopts import Group, Parameter
 
 from autoalign.cli.files import SCREEN_PIXEL, check_mask_format, check_outputs
-from autoalign.cli.terminal import FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
+from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
 from autoalign.cli.view import Viewing, check_viewing, recording_beside, show
 from autoalign.files.points import CORRESPONDENCES, read_points
-from autoalign.files.read import LoadedPicture, read_picture
+from autoalign.files.read import LoadedPicture, ReadOptions, read_picture
 from autoalign.files.record import record
 from autoalign.files.result import ResultFiles, write_result
 from autoalign.files.sidecar import default_sidecar, sidecar_text, write_sidecar
@@ -61,6 +61,10 @@ class PairFiles:
     """picture of FIXED's size that is not black where FIXED is to be ignored"""
     moving_mask: Path | None = None
     """picture of MOVING's size that is not black where MOVING is to be ignored"""
+    fixed_page: int = 0
+    """page of FIXED, a TIFF of several, counted from 0"""
+    moving_page: int = 0
+    """page of MOVING, a TIFF of several, counted from 0"""
 
 
 def pair(
@@ -70,8 +74,9 @@ def pair(
     *,
     files: Annotated[PairFiles, Parameter(name="*", group=FILES)] = PairFiles(),
     drawing: Annotated[Drawing, Parameter(name="*", group=FILES)] = Drawing(),
+    reading: Annotated[ReadOptions, Parameter(name="*", group=FILES)] = ReadOptions(),
     viewing: Annotated[Viewing, Parameter(name="*", group=Group("Viewer", sort_key=1.5))] = Viewing(),
-    options: Annotated[AlignOptions, Parameter(name="*", group=Group("Alignment", sort_key=2))] = AlignOptions(),
+    options: Annotated[AlignOptions, Parameter(name="*", group=ALIGNMENT)] = AlignOptions(),
     common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
 ) -> int:
     """Align, draw, keep the record, say how it went.
@@ -84,7 +89,11 @@ def pair(
         the picture that is put onto it
     """
     started = time.perf_counter()
-    still, mover = read_picture(fixed), read_picture(moving)
+    still = read_picture(fixed, reading, page=files.fixed_page)
+    mover = read_picture(moving, reading, page=files.moving_page)
+    for loaded in (still, mover):
+        if loaded.remark:
+            note(f"{loaded.remark}: {loaded.path}", common)
     drawn = like_bordered(mover.pixels, drawing.border)
     output = files.output or default_output(moving, drawn)
     sidecar = None if files.json == STDOUT else files.json or default_sidecar(output)
@@ -106,7 +115,9 @@ def pair(
             overlay_style=files.overlay_style,
         )
         written = write_result(pictures, still, mover, alignment.fixed_from_moving, drawing, common.overwrite)
-    kept = record(alignment, still, mover, drawn=asdict(drawing), timings=files.timings)
+    pages = {"fixed_page": files.fixed_page, "moving_page": files.moving_page}
+    drawn_from = asdict(drawing) | asdict(reading) | pages
+    kept = record(alignment, still, mover, drawn=drawn_from, timings=files.timings)
     if sidecar is None:
         sys.stdout.write(sidecar_text(kept))
     else:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import Group, Parameter
 
-FILES, GENERAL = Group("Files", sort_key=1), Group("General", sort_key=4)
+FILES, ALIGNMENT, GENERAL = Group("Files", sort_key=1), Group("Alignment", sort_key=2), Group("General", sort_key=4)
 
 
 STYLE_OF = {"aligned": "bold green", "doubtful": "bold yellow", "rejected": "bold red", "failed": "bold magenta"}

@@ -1,0 +1,135 @@
+"""`autoalign watch`: pictures aligned as they arrive in a folder."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from autoalign.batch.arrivals import Arrivals, hints
+from autoalign.batch.engine import Engine
+from autoalign.batch.jobs import Job, JobOptions, Recorded
+from autoalign.batch.ledger import Ledger
+from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
+from autoalign.batch.sources import Selection, onto_reference
+from autoalign.batch.telling import write_reports
+from autoalign.cli.progress import tally
+from autoalign.cli.running import RUNNING, Running, engine_of, in_words, make_folder
+from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, complain, note, tell
+from autoalign.errors import ImageReadError, ImageWriteError
+from autoalign.files.read import read_picture
+from autoalign.registration.alignment import AlignOptions
+from autoalign.registration.drawing import Drawing
+
+UNSETTLED_S = 0.5  # between looks while a file is still being written
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchFiles:
+    """What arrives where, and where it goes."""
+
+    reference: Path
+    """picture that all that arrive go onto"""
+    out_dir: Path
+    """folder for the results; there the same command finds what it has done already"""
+    save_rrd: Recorded = "none"
+    """also record pairs for `autoalign view`: those that are not aligned, or all"""
+    rescan: float = 10.0
+    """seconds between two looks at the folder where the system tells of nothing, as on network disks"""
+    until_idle: float | None = None
+    """seconds without a new picture after which it ends; otherwise Ctrl-C ends it"""
+
+
+def watch(
+    folder: Path,
+    /,
+    *,
+    files: Annotated[WatchFiles, Parameter(name="*", group=FILES)],
+    selection: Annotated[Selection, Parameter(name="*", group=FILES)] = Selection(),
+    drawing: Annotated[Drawing, Parameter(name="*", group=FILES)] = Drawing(),
+    running: Annotated[Running, Parameter(name="*", group=RUNNING)] = Running(),
+    options: Annotated[AlignOptions, Parameter(name="*", group=ALIGNMENT)] = AlignOptions(),
+    common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
+) -> int:
+    """Take what arrives, align it, look again.
+
+    Parameters
+    ----------
+    folder
+        where pictures arrive
+    """
+    if not folder.is_dir():
+        raise ImageReadError(f"is no folder: {folder}")
+    read_picture(files.reference)  # a reference that is no good should not be found out at night
+    make_folder(files.out_dir)
+    wanted = JobOptions(align=options, drawing=drawing, recorded=files.save_rrd)
+    about = {"watched": str(folder)} | in_words(files, selection, drawing, running, options)
+    engine, counts = engine_of(running), Counter[str]()
+    with (
+        Ledger(files.out_dir) as ledger,
+        feature_store(files.out_dir, running.cache) as store,
+        _until_told(),
+    ):
+        ledger.begin_run(about)
+        note(f"watching {folder}; Ctrl-C ends it", common)
+        for names in _arriving(folder, selection, files):
+            jobs = onto_reference(folder, names, files.reference, files.out_dir, wanted)
+            counts.update(_align(jobs, files, ledger, engine, store, common))
+            write_reports(files.out_dir, ledger, about, sequence=False)
+    tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing arrived")
+    return Exit.DONE if set(counts) <= {"aligned"} else Exit.NOT_ALIGNED
+
+
+def _arriving(folder: Path, selection: Selection, files: WatchFiles) -> Iterator[list[str]]:
+    """The names of pictures, some at a time, as they become whole."""
+    arrivals = Arrivals(folder, selection, without=files.out_dir)
+    idle_since = time.monotonic()
+    with hints(folder, arrivals, recursive=selection.recursive) as hint:
+        while True:
+            hint.clear()  # before the look: what comes during it is seen at the next one
+            names = arrivals.take()
+            if names:
+                yield names
+                idle_since = time.monotonic()
+            elif files.until_idle is not None and time.monotonic() - idle_since > files.until_idle:
+                return
+            hint.wait(UNSETTLED_S if arrivals.waiting() or files.until_idle is not None else files.rescan)
+
+
+def _align(
+    jobs: Sequence[Job], files: WatchFiles, ledger: Ledger, engine: Engine, store: Path, common: Common
+) -> Iterator[str]:
+    """The statuses of what has arrived, a line for each."""
+    wishes = PlanOptions(overwrite=common.overwrite, more=True, again=frozenset([str(files.reference)]))
+    try:
+        plan = planned(jobs, files.out_dir, ledger, store, wishes)
+    except ImageWriteError as error:  # a file in the way of one is no reason to leave the others unwatched
+        complain(str(error))
+        return
+    for row in carry_out(plan, ledger, engine):
+        if not common.quiet:
+            tell(f"{row.status} {row.name}: {row.reason}", style=STYLE_OF[row.status])
+        yield row.status
+
+
+@contextmanager
+def _until_told() -> Iterator[None]:
+    """Until Ctrl-C, or the system asks to end: for a watch both are a good end."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        signal.signal(signal.SIGTERM, before)
