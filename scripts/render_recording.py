@@ -1,6 +1,6 @@
 """A recording as the viewer shows it, to a PNG, on a machine without a screen or a graphics card.
 
-    python scripts/render_recording.py RECORDING.rrd OUT.png [--size 1680x1000] [--max-side 1680] [--fade 0..60]
+    python scripts/render_recording.py RECORDING.rrd OUT.png [--size 1680x1000] [--max-side 1680] [--at fade=30]
 
 The viewer runs headless on a software rasteriser: apt-get install mesa-vulkan-drivers libvulkan1. It panics on letters
 that its fonts do not have (Chinese names of pictures, say), and exits with 1 if it logged an error.
@@ -31,13 +31,14 @@ def main() -> int:
     parser.add_argument("output", type=Path)
     parser.add_argument("--size", default="1680x1000", help="of the window")
     parser.add_argument("--max-side", type=int, default=1680, help="of the PNG; the viewer paints at twice the size")
-    parser.add_argument("--fade", type=int, help="step of the timeline `fade` to stop at")
+    parser.add_argument("--at", help="where the time bar is to stand: a timeline and a step of it, as in fade=30")
     words = parser.parse_args()
     with viewer(words.size) as client:
         client.open(str(words.recording.resolve()))
         time.sleep(TOASTS_S)
-        if words.fade is not None:
-            patiently(lambda: client.set_time("fade", sequence=words.fade, play_state="paused"))
+        if words.at is not None:
+            timeline, _, step = words.at.partition("=")
+            patiently(lambda: client.set_time(timeline, sequence=int(step), play_state="paused"))
         words.output.write_bytes(settled(client, words.max_side))
         errors = [entry for entry in patiently(client.get_logs) if "ERROR" in str(entry.level).upper()]
     for entry in errors:

@@ -1,4 +1,4 @@
-"""An Alignment in the rerun viewer. The only file that imports rerun.
+"""An Alignment in the rerun viewer. Only `viewer_batch` imports rerun, too.
 
 Everything is logged in full pixels of its own picture. The half pixel: rerun's 2D views cover (0, 0) to (w, h), so that
 the centre of the first pixel lies at (0.5, 0.5); autoalign has it at (0, 0). `_at` adds it, to every point.
@@ -136,11 +136,7 @@ def recorded(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.rrd"
         # A viewer keeps one layout per application: two pairs in one window would share that of the last one.
-        application = f"{APPLICATION} {recording_id[:8]}"
-        recording = rr.RecordingStream(application, recording_id=recording_id, send_properties=False)
-        # The clock of the logging process says nothing about a pair, and would fill the menu of timelines.
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
+        recording = quiet_recording(f"{APPLICATION} {recording_id[:8]}", recording_id)
         recording.set_sinks(rr.FileSink(path), *([rr.GrpcSink(stream_to)] if stream_to else []))
         log_alignment(
             recording,
@@ -157,6 +153,15 @@ def recorded(
             raise OSError(f"the viewer did not take the recording ({error})") from error
         recording.disconnect()  # which writes the footer
         return path.read_bytes()
+
+
+def quiet_recording(application: str, recording_id: str) -> rr.RecordingStream:
+    """A recording of nothing but what is logged: when that was says nothing about a pair, would differ from run to run,
+    and would fill the viewer's menu of timelines."""
+    recording = rr.RecordingStream(application, recording_id=recording_id, send_properties=False)
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    return recording
 
 
 def _recording_id(fixed: LoadedPicture, moving: LoadedPicture, alignment: Alignment) -> str:
