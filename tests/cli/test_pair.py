@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 import autoalign as aa
 from autoalign.cli import pair as pair_module
@@ -241,3 +242,30 @@ def test_main_returns_what_the_process_ends_with(pictures, capsys):
         [sys.executable, "-m", "autoalign.cli.main", "pair", "fixed.jpg", "missing.jpg"], capture_output=True, text=True
     )
     assert (done.returncode, done.stdout, done.stderr) == (3, "", capsys.readouterr().err)
+
+
+def test_a_damaged_picture_is_taken_only_on_request(pictures, run):
+    data = (pictures / "moving.jpg").read_bytes()
+    (pictures / "moving.jpg").write_bytes(data[: len(data) * 4 // 5])
+    assert run("pair", "fixed.jpg", "moving.jpg").code == 3
+    outcome = run("pair", "fixed.jpg", "moving.jpg", "--lenient")
+    assert "is damaged (" in outcome.err.splitlines()[0]
+    assert outcome.err.splitlines()[0].endswith(": moving.jpg")
+    record = json.loads((pictures / "moving_aligned.autoalign.json").read_text())
+    assert list(record["stages"]["reading"]) == ["moving"]
+    assert record["options"]["lenient"] is True
+
+
+def test_pages_and_the_size_that_is_allowed(pictures, run):
+    pages = np.stack([aa.read_picture("fixed.jpg").pixels] * 2)
+    pages[0] = 0
+    tifffile.imwrite("pages.tif", pages, photometric="rgb")
+    words = ("pair", "pages.tif", "moving.jpg", "--fixed-page", "1", "-q")
+    assert "megapixels" in run(*words, "--max-pixels", "1e4").err
+    assert run(*words).code == 0
+    assert "no page 2" in run("pair", "pages.tif", "moving.jpg", "--fixed-page", "2").err
+    stack = np.stack([aa.read_picture("moving.jpg").pixels] * 2)
+    stack[0] = 0
+    tifffile.imwrite("stack.tif", stack, photometric="rgb")
+    assert run("apply", "moving_aligned.autoalign.json", "stack.tif", "--page", "1", "-q").code == 0
+    assert aa.read_picture("stack_aligned.tif").pixels.max() > 0

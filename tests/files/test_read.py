@@ -21,14 +21,14 @@ import tifffile
 from PIL import Image, ImageOps
 
 from autoalign.errors import ImageReadError
-from autoalign.files.read import LoadedPicture, read_picture, read_text, upright
+from autoalign.files.read import LoadedPicture, ReadOptions, read_picture, read_text, upright
 
 ORIENTATION = 274
 
 
-def refusal(path: str | Path, **options: Any) -> str:
+def refusal(path: str | Path, page: int = 0, **options: Any) -> str:
     with pytest.raises(ImageReadError) as caught:
-        read_picture(path, **options)
+        read_picture(path, ReadOptions(**options), page=page)
     message = str(caught.value)
     assert "\n" not in message
     assert message.endswith(f": {path}")
@@ -319,6 +319,68 @@ def test_one_wrong_bit_in_a_png(tmp_path: Path, make_picture: Any) -> None:
         assert re.search("is damaged|megapixels", refusal(tmp_path / "a.png"))
 
 
+# Lenient: what can be had
+
+
+def leniently(path: Path) -> LoadedPicture:
+    loaded = read_picture(path, ReadOptions(lenient=True))
+    assert loaded.remark is not None
+    assert loaded.remark.startswith("is damaged (")
+    assert "\n" not in loaded.remark
+    return loaded
+
+
+@pytest.mark.parametrize(
+    ("format", "mode"),
+    [
+        *(("PNG", mode) for mode in ("1", "L", "P", "RGB", "RGBA")),
+        *(("JPEG", mode) for mode in ("L", "RGB")),
+        *(("BMP", mode) for mode in ("L", "RGB")),
+        *(("TIFF", compression) for compression in ("none", "lzw", "zlib")),
+    ],
+)
+def test_first_half_of_a_file(tmp_path: Path, format: str, mode: str) -> None:
+    pixels = np.random.default_rng(3).integers(0, 256, (200, 61, 3), np.uint8)  # as many bytes in every row
+    if format == "TIFF":
+        stream = io.BytesIO()
+        tifffile.imwrite(stream, pixels, photometric="rgb", compression=mode, rowsperstrip=20)
+        data = stream.getvalue()
+    else:
+        data = encoded(Image.fromarray(pixels).convert(mode), format)
+    (tmp_path / "whole").write_bytes(data)
+    whole = read_picture(tmp_path / "whole", ReadOptions(lenient=True))
+    assert whole.remark is None
+    (tmp_path / "half").write_bytes(data[: int(len(data) * 0.6)])
+    assert "is damaged" in refusal(tmp_path / "half")
+    half = leniently(tmp_path / "half").pixels
+    assert half.shape == whole.pixels.shape
+    rows = slice(None, 80) if format != "BMP" else slice(-80, None)  # which begins at the bottom
+    difference = np.abs(half.astype(int) - whole.pixels)[rows]
+    assert difference.max() <= (2 if format == "JPEG" else 0)
+
+
+def test_damage_inside_costs_a_part(tmp_path: Path, make_picture: Any) -> None:
+    pixels = make_picture(size=(97, 160))
+    (tmp_path / "a.png").write_bytes(encoded(Image.fromarray(pixels), "PNG"))
+    tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", compression="zlib", tile=(32, 32))
+    for name in ("a.png", "a.tif"):
+        data = bytearray((tmp_path / name).read_bytes())
+        data[len(data) * 7 // 10 : len(data) * 7 // 10 + 8] = bytes(8)
+        (tmp_path / name).write_bytes(data)
+        assert "is damaged" in refusal(tmp_path / name)
+        found = leniently(tmp_path / name).pixels
+        assert 0.5 < (found == pixels).all(axis=-1).mean() < 1
+
+
+def test_what_even_leniency_does_not_take(tmp_path: Path, make_picture: Any) -> None:
+    for format in ("PNG", "JPEG", "TIFF", "WebP", "AVIF"):
+        data = encoded(Image.fromarray(make_picture(size=(97, 61))), format)
+        (tmp_path / "a").write_bytes(data[:30])
+        assert f"is damaged, or no {format}" in refusal(tmp_path / "a", lenient=True)
+    (tmp_path / "bomb.png").write_bytes(one_bit_png(30_000, 30_000)[:500])
+    assert "megapixels" in refusal(tmp_path / "bomb.png", lenient=True)
+
+
 def one_bit_png(w: int, h: int) -> bytes:
     def chunk(kind: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
@@ -344,7 +406,7 @@ def test_bombs_cost_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("extension", ["jpg", "png", "tif", "webp", "bmp", "avif"])
 def test_the_limit_is_the_callers(tmp_path: Path, extension: str) -> None:
     path = saved(tmp_path / f"a.{extension}", Image.new("RGB", (50, 30)))
-    assert read_picture(path, max_pixels=1500).pixels.shape == (30, 50, 3)
+    assert read_picture(path, ReadOptions(max_pixels=1500)).pixels.shape == (30, 50, 3)
     assert "(50 x 30), more than" in refusal(path, max_pixels=1499)
 
 

@@ -14,6 +14,7 @@ from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, complain, note
 from autoalign.errors import ImageReadError, ImageWriteError
 from autoalign.files.metadata import on_grid_of
 from autoalign.files.points import POSITIONS, read_points, write_points
+from autoalign.files.read import LoadedPicture, ReadOptions
 from autoalign.files.result import write_mask
 from autoalign.files.sidecar import Sidecar, read_sidecar, transform_of
 from autoalign.files.sized import read_sized
@@ -41,6 +42,8 @@ class ApplyOptions:
     """where there is no data: see-through, black, or the nearest pixel repeated; by default as `pair` was told"""
     save_mask: Path | None = None
     """also write where the result has data, in its frame: a PNG or TIFF, white for data; for one picture"""
+    page: int = 0
+    """page of each IMAGE that is a TIFF of several, counted from 0"""
     points: Path | None = None
     """map these points of MOVING to FIXED: CSV with the columns x, y; by default to <CSV>_on_fixed.csv beside it"""
     inverse: bool = False
@@ -52,6 +55,7 @@ def apply(
     /,
     *images: Path,
     options: Annotated[ApplyOptions, Parameter(name="*", group=FILES)] = ApplyOptions(),
+    reading: Annotated[ReadOptions, Parameter(name="*", group=FILES)] = ReadOptions(),
     common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
 ) -> int:
     """Read the record, then one picture after the other, or the points.
@@ -85,7 +89,8 @@ def apply(
     worst = Exit.DONE
     for image, output in zip(images, outputs, strict=True):
         try:
-            _put(record, image, output, drawing, options, common)
+            loaded = read_sized(image, record.moving.size, reading, page=options.page)
+            _put(record, loaded, output, drawing, options, common)
         except (ImageReadError, ImageWriteError) as error:  # the others are still wanted
             complain(str(error))
             worst = Exit.FILE
@@ -108,9 +113,12 @@ def _output(image: Path, options: ApplyOptions, drawing: Drawing) -> Path:
     return options.output or named
 
 
-def _put(record: Sidecar, image: Path, output: Path, drawing: Drawing, options: ApplyOptions, common: Common) -> None:
+def _put(
+    record: Sidecar, loaded: LoadedPicture, output: Path, drawing: Drawing, options: ApplyOptions, common: Common
+) -> None:
     """One picture through the transform."""
-    loaded = read_sized(image, record.moving.size)
+    if loaded.remark:
+        note(f"{loaded.remark}: {loaded.path}", common)
     check_format(output, like_bordered(loaded.pixels, drawing.border))
     transform = transform_of(record)
     drawn = draw(loaded.pixels, record.fixed.size, transform, drawing, interpolation=options.interpolation)

@@ -12,7 +12,7 @@ from autoalign.cli.files import check_outputs
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, note, tell
 from autoalign.files.metadata import without_grid
 from autoalign.files.points import PLANE_POINTS, read_points
-from autoalign.files.read import read_picture
+from autoalign.files.read import ReadOptions, read_picture
 from autoalign.files.write import default_output, write_picture
 from autoalign.geometry.family import fit
 from autoalign.picture.canvas import plane_canvas
@@ -37,6 +37,7 @@ def rectify(
     /,
     *,
     options: Annotated[RectifyOptions, Parameter(name="*", group=FILES)],
+    reading: Annotated[ReadOptions, Parameter(name="*", group=FILES)] = ReadOptions(),
     common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
 ) -> int:
     """Fit the plane, draw it, say how it went.
@@ -46,7 +47,9 @@ def rectify(
     image
         the picture of a facade, a page, a floor; it stays as it is
     """
-    loaded = read_picture(image)
+    loaded = read_picture(image, reading)
+    if loaded.remark:
+        note(f"{loaded.remark}: {image}", common)
     suffix = default_output(image, loaded.pixels).suffix
     output = options.output or image.with_name(f"{image.stem}_rectified{suffix}")
     check_outputs([(output, loaded.pixels)], inputs=[image, options.points], overwrite=common.overwrite)

@@ -28,7 +28,7 @@ class Header:
 
 @dataclass(frozen=True, kw_only=True)
 class Decoder:
-    """Both take the bytes of a file and raise `Refused` with a reason, or on damaged bytes whatever they like."""
+    """Both take the bytes of a file, and raise `Refused` with a reason, or on damaged bytes whatever they like."""
 
     read_header: Callable[[bytes], Header]  # allocates nothing that a lying header could make large
     decode: Callable[[bytes], Picture]  # as stored, not turned; called after the size was found bearable

@@ -145,6 +145,9 @@ RAW = Format(
 FORMATS = (JPEG, PNG, RAW, TIFF, WEBP, BMP, AVIF, JPEG_2000, JPEG_XL, HEIC)
 """In the order in which they are tried: what goes by its name comes before what it looks like."""
 
+LENIENT = (JPEG, PNG, TIFF, BMP)
+"""Formats of which a damaged file has parts that can be read without the others."""
+
 STRANGERS = {
     "GIF": rb"GIF8",
     "OpenEXR": rb"\x76\x2f\x31\x01",  # half floats, layers and linear light: float TIFF holds what is needed of it
@@ -173,27 +176,30 @@ def of_name(path: Path) -> Format | None:
     return next((format for format in FORMATS if path.suffix.lower() in format.extensions), None)
 
 
-def decoder_for(format: Format, page: int) -> Decoder:
-    """What reads this format; `Refused` for a page other than 0 of a format that has but one."""
+def decoder_for(format: Format, page: int, lenient: bool = False) -> Decoder:
+    """What reads this format; `Refused` for a page other than 0 of a format that has but one.
+
+    `lenient` takes of a damaged file what can be had, if the format is one of `LENIENT`.
+    """
     if page != 0 and format is not TIFF:
         raise Refused(f"is a {format.name} file, which has no page {page} (pages count from 0)")
     match format.name:
         case "TIFF":
             from autoalign.files import tiff
 
-            return tiff.decoder(page)
+            return tiff.decoder(page, lenient)
         case "JPEG":
             from autoalign.files import jpeg
 
-            return jpeg.decoder()
+            return jpeg.decoder(lenient)
         case "PNG":
             from autoalign.files import png
 
-            return png.decoder()
+            return png.decoder(lenient)
         case "WebP" | "BMP":
             from autoalign.files import pillow
 
-            return pillow.webp_decoder() if format is WEBP else pillow.bmp_decoder()
+            return pillow.webp_decoder() if format is WEBP else pillow.bmp_decoder(lenient)
         case "AVIF":
             from autoalign.files import avif
 

@@ -10,6 +10,7 @@ import hashlib
 import re
 import struct
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import simplejpeg
@@ -35,9 +36,9 @@ INCHES_PER_UNIT = {1: 1.0, 2: 1 / 2.54}  # JFIF's density units; 0 is an aspect 
 MAX_DENSITY = 0xFFFF
 
 
-def decoder() -> Decoder:
-    """RGB or grey, uint8. CMYK is refused."""
-    return Decoder(read_header=_read_header, decode=_decode)
+def decoder(lenient: bool = False) -> Decoder:
+    """RGB or grey, uint8. CMYK is refused. `lenient`: what is missing is grey, what is damaged as it comes."""
+    return Decoder(read_header=_read_header, decode=partial(_decode, strict=not lenient))
 
 
 def encoder(quality: int) -> Encoder:
@@ -65,9 +66,9 @@ def _read_header(data: bytes) -> Header:
     return Header(size=(w, h), orientation=exif_orientation(metadata.exif), metadata=metadata)
 
 
-def _decode(data: bytes) -> Picture:
+def _decode(data: bytes, strict: bool) -> Picture:
     grey = simplejpeg.decode_jpeg_header(data)[2] == "Gray"
-    pixels: Picture = simplejpeg.decode_jpeg(data, colorspace="GRAY" if grey else "RGB", strict=True)
+    pixels: Picture = simplejpeg.decode_jpeg(data, colorspace="GRAY" if grey else "RGB", strict=strict)
     return pixels[..., 0] if grey else pixels
 
 

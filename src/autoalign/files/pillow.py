@@ -28,11 +28,19 @@ def webp_decoder() -> Decoder:
     return _decoder(WebPImageFile)
 
 
-def bmp_decoder() -> Decoder:
-    """Grey or RGB, with or without alpha, uint8; palettes are resolved."""
+def bmp_decoder(lenient: bool = False) -> Decoder:
+    """Grey or RGB, with or without alpha, uint8; palettes are resolved. `lenient`: what is missing is 0."""
     from PIL.BmpImagePlugin import BmpImageFile
 
-    return _decoder(BmpImageFile)
+    strict = _decoder(BmpImageFile)
+    if not lenient:
+        return strict
+
+    def decode(data: bytes) -> Picture:
+        w, h = strict.read_header(data).size
+        return strict.decode(data + bytes(4 * (w + 4) * h))  # as much as the pixels can be
+
+    return Decoder(read_header=strict.read_header, decode=decode)
 
 
 def webp_encoder() -> Encoder:

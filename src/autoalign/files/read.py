@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -130,16 +130,19 @@ def _decoded(
     """The header, the upright pixels and a remark; whatever a decoder raises as an ImageReadError."""
     max_pixels = options.max_pixels or MAX_PIXELS
     try:
-        return *_decoded_by(decoder_for(format, page), data, max_pixels), None
+        try:
+            return *_decoded_by(decoder_for(format, page), data, max_pixels), None
+        except Refused:
+            raise
+        except Exception as error:  # decoders raise what they like on damaged bytes: struct, zlib, memory, their own
+            if not options.lenient or format not in LENIENT:
+                raise
+            remark = f"is damaged ({one_line(error)}), and what could be read of it was taken"
+            return *_decoded_by(decoder_for(format, page, lenient=True), data, max_pixels), remark
     except Refused as refusal:
         raise ImageReadError(f"{refusal}: {path}") from refusal
-    except Exception as error:  # decoders raise what they like on damaged bytes: struct, index, zlib, memory, their own
-        fault = one_line(error)
-        if options.lenient and format in LENIENT:
-            with suppress(Exception):
-                header, pixels = _decoded_by(decoder_for(format, page, lenient=True), data, max_pixels)
-                return header, pixels, f"is damaged ({fault}), and what could be read of it was taken: {path}"
-        raise ImageReadError(f"is damaged, or no {format.name} that can be read ({fault}): {path}") from error
+    except Exception as error:
+        raise ImageReadError(f"is damaged, or no {format.name} that can be read ({one_line(error)}): {path}") from error
 
 
 def _decoded_by(decoder: Decoder, data: bytes, max_pixels: float) -> tuple[Header, Picture]:

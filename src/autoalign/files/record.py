@@ -42,7 +42,7 @@ def record(
         moving=_picture(moving),
         options=asdict(alignment.options) | dict(drawn or {}),
         versions=versions(),
-        stages=alignment.counts(),
+        stages=alignment.counts() | _remarks(fixed, moving),
         evidence={name: _finite(value) for name, value in alignment.evidence().items()},
         timings_s=alignment.seconds if timings else None,
     )
@@ -81,6 +81,12 @@ def versions() -> dict[str, str]:
         "opencv": cv2.__version__,
         "python": platform.python_version(),
     }
+
+
+def _remarks(fixed: LoadedPicture, moving: LoadedPicture) -> dict[str, Any]:
+    """What had to be overlooked to read the files; nothing where nothing had."""
+    said = {name: loaded.remark for name, loaded in (("fixed", fixed), ("moving", moving)) if loaded.remark}
+    return {"reading": said} if said else {}
 
 
 def _finite(value: Any) -> Any:

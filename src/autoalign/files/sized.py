@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from autoalign.errors import ImageReadError
-from autoalign.files.read import LoadedPicture, read_picture
+from autoalign.files.read import LoadedPicture, ReadOptions, read_picture
 from autoalign.geometry.homography import Mask
 from autoalign.picture.pixels import grey, size_of
 
@@ -19,9 +19,11 @@ class LoadedMask:
     sha256: str  # of the file's bytes
 
 
-def read_sized(path: Path, size: tuple[int, int]) -> LoadedPicture:
+def read_sized(
+    path: Path, size: tuple[int, int], options: ReadOptions = ReadOptions(), *, page: int = 0
+) -> LoadedPicture:
     """Read a picture that must be of `size` (w, h). Raises ImageReadError, the path last."""
-    loaded = read_picture(path)
+    loaded = read_picture(path, options, page=page)
     if size_of(loaded.pixels) != size:
         (w, h), (wanted_w, wanted_h) = size_of(loaded.pixels), size
         raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {path}")
