@@ -81,7 +81,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "row",
         )
     },
-    {"views": ("motion", "words", "evidence", "pictures", "charts", "report", "viewer", "viewer_batch", "window")},
+    {"views": ("motion", "tally", "words", "evidence", "pictures", "charts", "report", "viewer", "viewer_batch", "window")},
     {
         "batch": (
             "jobs",

@@ -13,10 +13,8 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path, PurePath
-from statistics import median
 from string import Template
 from typing import Any
 from urllib.parse import quote
@@ -26,6 +24,7 @@ from autoalign.files.row import ROW_STATUSES, Row, RowStatus, Thumbnails
 from autoalign.files.write import writing_atomically
 from autoalign.views.charts import log_histogram, over_frames, shares
 from autoalign.views.motion import Motion, motion
+from autoalign.views.tally import Tally
 from autoalign.views.words import MARK_OF, moved, number, plain
 
 _ROWS = "<!-- rows -->"  # where they stand in the template
@@ -58,33 +57,18 @@ def write_report(
         "style": style,
         "script": script,
     }
-    tally = _Tally()
     with writing_atomically(path, overwrite) as write:
         write(Template(before).substitute(fixed).encode())
-        _write_rows(write, rows, tally)
-        write(Template(after).substitute(fixed, **_summary(tally, about, sequence)).encode())
+        tally, motions = _write_rows(write, rows)
+        summary = _summary(tally, about, motions if sequence else None)
+        write(Template(after).substitute(fixed, **summary).encode())
 
 
-@dataclass
-class _Tally:
-    """What the summary needs of all rows."""
-
-    counts: dict[RowStatus, int] = field(default_factory=lambda: dict.fromkeys(ROW_STATUSES, 0))
-    errors_px: dict[RowStatus, list[float]] = field(default_factory=lambda: {"aligned": [], "doubtful": []})
-    motions: list[Motion | None] = field(default_factory=list)  # None where there is no transform
-    worst: tuple[float, int, str] | None = None  # expected error, number and name of an aligned row
-
-    def add(self, row: Row, moves: Motion | None) -> None:
-        self.counts[row.status] += 1
-        self.motions.append(moves)
-        error = _finite(row.expected_error_px)
-        if error is not None and row.status in self.errors_px:
-            self.errors_px[row.status].append(error)
-            if row.status == "aligned" and (self.worst is None or error > self.worst[0]):
-                self.worst = error, len(self.motions), row.name
-
-
-def _write_rows(write: Callable[[bytes], None], rows: Iterable[tuple[Row, Thumbnails | None]], tally: _Tally) -> None:
+def _write_rows(
+    write: Callable[[bytes], None], rows: Iterable[tuple[Row, Thumbnails | None]]
+) -> tuple[Tally, list[Motion | None]]:
+    """Write them, and return what the summary needs: a motion per row, None where there is no transform."""
+    tally, motions = Tally(), list[Motion | None]()
     numbers: dict[bytes, int] = {}  # of the pictures that are written, by what they hold
 
     def numbered(picture: bytes | None) -> int | None:
@@ -100,9 +84,11 @@ def _write_rows(write: Callable[[bytes], None], rows: Iterable[tuple[Row, Thumbn
     for row, pictures in rows:
         three = () if pictures is None else (pictures.fixed, pictures.before, pictures.after)
         shown = [numbered(picture) for picture in three] or None
-        moves = _motion(row)
-        tally.add(row, moves)
-        write(b'<script type="application/json" class="row">%b</script>\n' % _json(_record(row, moves, shown)))
+        tally.add(row)
+        motions.append(_motion(row))
+        record = _record(row, motions[-1], shown)
+        write(b'<script type="application/json" class="row">%b</script>\n' % _json(record))
+    return tally, motions
 
 
 def _record(row: Row, moves: Motion | None, pictures: list[int | None] | None) -> dict[str, Any]:
@@ -137,17 +123,18 @@ def _motion(row: Row) -> Motion | None:
     return found if known else None
 
 
-def _summary(tally: _Tally, about: Mapping[str, str], sequence: bool) -> dict[str, str]:
+def _summary(tally: Tally, about: Mapping[str, str], drift: list[Motion | None] | None) -> dict[str, str]:
     """What stands above the table."""
-    total = sum(tally.counts.values())
-    cards = [_errors_card(tally), _about_card(about), _drift_card(tally.motions) if sequence else ""]
+    counts = {status: tally.counts[status] for status in ROW_STATUSES}
+    total = tally.total
+    cards = [_errors_card(tally), _about_card(about), "" if drift is None else _drift_card(drift)]
     return {
         "subtitle": f"{total:,} {'pair' if total == 1 else 'pairs'} · autoalign {__version__}",
-        "bar": shares(tally.counts),
+        "bar": shares(counts),
         "filters": "\n".join(
             [
                 f'<button type="button" id="all">all <b>{total:,}</b></button>',
-                *(_filter(*counted) for counted in tally.counts.items()),
+                *(_filter(*counted) for counted in counts.items()),
             ]
         ),
         "cards": "\n".join(card for card in cards if card),
@@ -163,16 +150,16 @@ def _filter(status: RowStatus, count: int) -> str:
     )
 
 
-def _errors_card(tally: _Tally) -> str:
+def _errors_card(tally: Tally) -> str:
     chart = log_histogram(tally.errors_px, "px")
     figures = ""
     if tally.worst is not None:
-        error, place, name = tally.worst
-        worst = f'<button type="button" class="link" data-show="{place}" dir="auto">{_text(name)}</button>'
+        place, name = tally.worst.number, _text(tally.worst.name)
+        worst = f'<button type="button" class="link" data-show="{place}" dir="auto">{name}</button>'
         figures = (
             '<dl class="figures">'
-            f"<div><dt>median of the aligned</dt><dd>{number(median(tally.errors_px['aligned']))} px</dd></div>"
-            f"<div><dt>worst of the aligned: {worst}</dt><dd>{number(error)} px</dd></div></dl>"
+            f"<div><dt>median of the aligned</dt><dd>{number(tally.median_px)} px</dd></div>"
+            f"<div><dt>worst of the aligned: {worst}</dt><dd>{number(tally.worst.error_px)} px</dd></div></dl>"
         )
     return f'<div class="card"><h2>Expected error</h2>{figures}{chart}</div>' if chart else ""
 

@@ -15,12 +15,10 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import rerun as rr
@@ -31,6 +29,7 @@ from autoalign.files.row import ROW_STATUSES, Row, RowStatus, Thumbnails
 from autoalign.files.write import writing_atomically
 from autoalign.views.evidence import STATUS_COLOUR
 from autoalign.views.pictures import THUMBNAIL_SIDE
+from autoalign.views.tally import Tally
 from autoalign.views.viewer import APPLICATION, quiet_recording
 from autoalign.views.words import MARK_OF, literal, number, plain, table
 
@@ -84,23 +83,10 @@ def _recording_id(title: str, about: Mapping[str, str]) -> str:
     return hashlib.sha256(what).hexdigest()[:32]
 
 
-class _Tally:
-    """What the summary needs of all rows."""
-
-    def __init__(self) -> None:
-        self.counts: Counter[RowStatus] = Counter()
-        self.errors_px: list[float] = []  # of the aligned
-
-    def add(self, row: Row) -> None:
-        self.counts[row.status] += 1
-        if row.status == "aligned" and row.expected_error_px is not None:
-            self.errors_px.append(row.expected_error_px)
-
-
 def _log_rows(
     recording: rr.RecordingStream, rows: Iterable[Illustrated], seconds: Callable[[str], float | None] | None
-) -> _Tally:
-    tally, left, first = _Tally(), iter(rows), 1
+) -> Tally:
+    tally, left, first = Tally(), iter(rows), 1
     shown: dict[str, bytes | None] = dict.fromkeys(_PICTURES)
     while part := list(islice(left, _TOGETHER)):
         for row, _ in part:
@@ -180,14 +166,14 @@ def _facts(row: Row) -> Iterator[tuple[str, str]]:
             yield name, literal(getattr(row, name))
 
 
-def _log_summary(recording: rr.RecordingStream, title: str, about: Mapping[str, str], tally: _Tally) -> None:
+def _log_summary(recording: rr.RecordingStream, title: str, about: Mapping[str, str], tally: Tally) -> None:
     """What is known at the end only: static, so that it is there at every pair."""
     counts = [(f"{MARK_OF[status]} {status}", f"{tally.counts[status]:,}") for status in ROW_STATUSES]
-    counts.append(("all", f"{tally.counts.total():,}"))
+    counts.append(("all", f"{tally.total:,}"))
     parts = [f"# {literal(title)}", table(("pairs", "count"), counts)]
     properties: dict[str, Any] = {status: tally.counts[status] for status in ROW_STATUSES}
-    if tally.errors_px:
-        middle, worst = median(tally.errors_px), max(tally.errors_px)
+    if tally.worst is not None:
+        middle, worst = tally.median_px, tally.worst.error_px
         parts.append(
             f"Expected error of the aligned: **{number(middle)} px** in the median, {number(worst)} px at worst."
         )
