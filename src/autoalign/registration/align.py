@@ -19,9 +19,9 @@ from autoalign.picture.pixels import Picture
 from autoalign.registration.agreement import agreement
 from autoalign.registration.alignment import Alignment, AlignOptions, Attempt, ModelChoice
 from autoalign.registration.features import Features, threads, with_reversed_contrast
+from autoalign.registration.frames import unmirrored
 from autoalign.registration.ladder import Rung, rungs
 from autoalign.registration.matching import Matches, match
-from autoalign.registration.mirror import unmirrored
 from autoalign.registration.prepared import Pair, Prepared, prepare
 from autoalign.registration.refine import refine
 from autoalign.registration.verdict import Verdict, hints, judge, nothing_found, significant, weigh
