@@ -21,7 +21,7 @@ from autoalign.batch.engine import Engine, InlineEngine, LocalEngine, cores, str
 from autoalign.batch.slot import Limits, Outcome
 from autoalign.errors import EngineError
 
-LIMITS = Limits(time_s=2, memory=400 * doomed.MB)
+LIMITS = Limits(memory=400 * doomed.MB)
 
 
 def by_job(outcomes: Iterator[Outcome[str, str]]) -> dict[str, Outcome[str, str]]:
@@ -41,7 +41,16 @@ def test_every_end_is_one_casualty_and_the_neighbours_survive() -> None:
         casualty = outcomes[job].casualty
         assert casualty is not None
         assert (outcomes[job].result, casualty.cause, casualty.reason) == (None, cause, reason)
-    assert 2 <= outcomes["hang"].seconds < 5
+
+
+def test_a_job_that_hangs_is_ended_in_time() -> None:
+    engine = LocalEngine(workers=1, limits=Limits(time_s=0.5))
+    hung, next_one = engine.run(doomed.fall, ["hang", "next one"])
+
+    assert hung.casualty is not None
+    assert (hung.casualty.cause, hung.casualty.reason) == ("timeout", "took more than 0.5 s")
+    assert 0.5 <= hung.seconds < 3
+    assert next_one.result == "survived next one"
 
 
 def test_a_result_that_cannot_be_sent_is_an_error_with_its_trace() -> None:
@@ -82,26 +91,6 @@ def test_a_worker_that_keeps_much_is_replaced_before_the_next_job_pays_for_it() 
 
     assert [outcome.casualty for outcome in outcomes] == [None] * 3
     assert len({outcome.result for outcome in outcomes}) == 3
-
-
-def test_a_worker_killed_between_jobs_costs_nothing() -> None:
-    def jobs() -> Iterator[float]:
-        yield 0.0
-        yield 0.0
-        yield 0.0
-        for child in psutil.Process().children(recursive=True):
-            if child.pid in seen:
-                child.kill()
-                child.wait()
-        yield 0.0
-
-    seen: set[int] = set()
-    casualties = []
-    for outcome in LocalEngine(workers=1).run(doomed.doze, jobs()):
-        seen.add(outcome.result or 0)
-        casualties.append(outcome.casualty)
-    assert casualties == [None] * 4
-    assert len(seen) == 2
 
 
 def test_the_initializer_runs_in_the_worker() -> None:
@@ -202,15 +191,9 @@ def test_stream_hands_out_what_comes_first() -> None:
         return future
 
     results = stream(submit, range(3), ahead=3)
-    assert next(results) == 2
+    assert next(results) == (2, waiting[2])
     waiting[0].set_result(0)
-    assert next(results) == 0
-
-
-@pytest.mark.parametrize("wrong", [{"time_s": 0}, {"time_s": float("nan")}, {"memory": 0}])
-def test_limits_must_be_possible(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="limit must be over 0"):
-        Limits(**wrong)  # type: ignore[arg-type]
+    assert next(results) == (0, waiting[0])
 
 
 def test_a_machine_without_workers_is_no_engine() -> None:

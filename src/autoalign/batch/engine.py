@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,7 +69,8 @@ class LocalEngine:
 
         with ThreadPoolExecutor(workers) as threads:  # they do nothing but wait for their workers
             try:
-                yield from stream(lambda job: threads.submit(run_somewhere, job), jobs, AHEAD * workers)
+                for _, future in stream(lambda job: threads.submit(run_somewhere, job), jobs, AHEAD * workers):
+                    yield future.result()
             finally:
                 threads.shutdown(wait=False, cancel_futures=True)
                 for slot in slots:
@@ -88,17 +89,18 @@ class InlineEngine:
             yield Outcome(job=job, result=result, casualty=casualty, seconds=time.monotonic() - started)
 
 
-def stream(submit: Callable[[J], Future[R]], jobs: Iterable[J], ahead: int) -> Iterator[R]:
-    """Submit the jobs, never more than `ahead` at a time, and yield what comes of them as it comes."""
-    under_way: set[Future[R]] = set()
+def stream(submit: Callable[[J], Future[R]], jobs: Iterable[J], ahead: int) -> Iterator[tuple[J, Future[R]]]:
+    """Submit the jobs, never more than `ahead` at a time, and yield each with its future once that is done."""
+    done: SimpleQueue[tuple[J, Future[R]]] = SimpleQueue()
+    under_way = 0
     for job in jobs:
-        under_way.add(submit(job))
-        if len(under_way) >= ahead:
-            done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
-            yield from (future.result() for future in done)
-    while under_way:
-        done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
-        yield from (future.result() for future in done)
+        submit(job).add_done_callback(lambda future, job=job: done.put((job, future)))
+        under_way += 1
+        while under_way >= ahead or not done.empty():
+            yield done.get()
+            under_way -= 1
+    for _ in range(under_way):
+        yield done.get()
 
 
 def cores() -> int:

@@ -82,6 +82,7 @@ class Terms(Generic[J, R]):
     limits: Limits = field(default_factory=Limits)
     threads: int = 1  # that cv2 and BLAS may keep busy in each worker
     initializer: Callable[[], None] | None = None  # called once in each worker, before its first job
+    idle_s: float | None = None  # after so long without a job a worker goes, and another comes with the next job
 
 
 class Slot(Generic[J, R]):
@@ -169,7 +170,7 @@ class _Worker:
 
     def __init__(self, terms: Terms[Any, Any]) -> None:
         if mp.current_process().daemon:
-            raise EngineError("a daemonic process cannot have workers")
+            raise EngineError("no worker can be started by a process that is daemonic")
         context = _context(terms.function)
         self.line, far_end = context.Pipe()
         # Daemonic: it may not outlive this process, and has no children.
@@ -234,7 +235,7 @@ def _context(function: Callable[..., Any]) -> BaseContext:
         return mp.get_context("spawn")
     context = mp.get_context("forkserver")
     named = function.func if isinstance(function, functools.partial) else function
-    context.set_forkserver_preload([named.__module__])  # heard only by the first start in this process
+    context.set_forkserver_preload([__name__, named.__module__])  # heard only by the first start in this process
     return context
 
 
@@ -246,7 +247,7 @@ def _work(line: Connection, terms: Terms[Any, Any]) -> None:
     if terms.initializer is not None:
         terms.initializer()
     line.send(READY)
-    while True:
+    while line.poll(terms.idle_s):
         try:
             job = line.recv()
         except EOFError:
