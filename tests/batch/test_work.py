@@ -11,7 +11,7 @@ import pytest
 import autoalign as aa
 from autoalign.batch import memory
 from autoalign.batch.jobs import Job, JobOptions, key
-from autoalign.batch.memory import PictureMemory
+from autoalign.batch.memory import PictureMemory, Source
 from autoalign.batch.work import Task, do_task
 from autoalign.errors import ImageReadError
 from autoalign.files.feature_store import recall_from
@@ -96,22 +96,22 @@ def test_cameras_that_write_two_files_under_one_stem(job):
 
 def test_a_picture_is_read_once_until_it_changes_or_there_is_no_room(folder, monkeypatch):
     read = []
-    monkeypatch.setattr(memory, "read_picture", lambda path: read.append(path) or aa.read_picture(path))
+    monkeypatch.setattr(memory, "read_picture", lambda path, *args, **named: read.append(path) or aa.read_picture(path))
     one, two = str(folder / "frame1.png"), str(folder / "frame2.png")
     roomy = PictureMemory()
-    assert roomy.ready(one) is roomy.ready(one)
-    roomy.ready(two)
-    roomy.ready(one)
+    assert roomy.ready(Source(path=one)) is roomy.ready(Source(path=one))
+    roomy.ready(Source(path=two))
+    roomy.ready(Source(path=one))
     assert read == [one, two]
     (folder / "frame1.png").write_bytes((folder / "frame10.png").read_bytes())
-    roomy.ready(one)
+    roomy.ready(Source(path=one))
     assert read == [one, two, one]
     tight = PictureMemory(max_bytes=1)
     for path in (one, two, one):
-        tight.ready(path)
+        tight.ready(Source(path=path))
     assert read == [one, two, one, one, two, one]
     with pytest.raises(ImageReadError, match="does not exist"):
-        roomy.ready(str(folder / "nowhere.png"))
+        roomy.ready(Source(path=str(folder / "nowhere.png")))
 
 
 def test_features_are_kept_on_disk_and_found_again(folder, tmp_path):

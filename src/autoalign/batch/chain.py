@@ -8,11 +8,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from autoalign.batch.engine import Engine
-from autoalign.batch.jobs import Job, JobOptions, key, readable
+from autoalign.batch.jobs import Job, key, readable
 from autoalign.batch.ledger import Ledger
 from autoalign.batch.work import Task
 from autoalign.errors import ImageReadError
 from autoalign.registration.align import align
+from autoalign.registration.drawing import Drawing
 from autoalign.registration.sequence import Link, SequenceOptions, link_of, links, solve_sequence
 
 
@@ -76,7 +77,7 @@ def _task(frames: Sequence[Job], fixed: int, moving: int, ledger: Ledger, store:
         frames[moving],
         fixed=frames[fixed].moving,
         fixed_mask=frames[fixed].moving_mask,
-        options=JobOptions(align=frames[moving].options.align),
+        options=replace(frames[moving].options, drawing=Drawing(), fixed_page=frames[moving].options.moving_page),
     )
     return Task(job=job, key=key(job, readable(ledger.hash_of)), store=str(store), again=frozenset(job.inputs))
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from autoalign import __version__
 from autoalign.errors import ImageReadError
+from autoalign.files.read import ReadOptions
 from autoalign.files.write import default_output
 from autoalign.picture.border import like_bordered
 from autoalign.picture.pixels import Picture, has_alpha
@@ -31,6 +32,9 @@ class JobOptions:
 
     align: AlignOptions = AlignOptions()
     drawing: Drawing = Drawing()
+    reading: ReadOptions = ReadOptions()
+    fixed_page: int = 0  # of a TIFF of several, counted from 0
+    moving_page: int = 0
     recorded: Recorded = "none"  # which pairs leave a recording for the viewer; failed: all but the aligned ones
 
 

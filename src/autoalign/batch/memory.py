@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from autoalign.files.feature_store import recall_from
-from autoalign.files.read import LoadedPicture, read_picture
+from autoalign.files.read import LoadedPicture, ReadOptions, read_picture
 from autoalign.files.sized import read_mask
 from autoalign.picture.pixels import size_of
 from autoalign.registration.prepared import Prepared, prepare
@@ -28,6 +28,16 @@ class Ready:
         return self.loaded.pixels.nbytes + self.prepared.nbytes
 
 
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where a picture is, and what of it is taken."""
+
+    path: str
+    mask: str | None = None  # a picture of the same size that is not black where this one is to be ignored
+    page: int = 0
+    reading: ReadOptions = ReadOptions()
+
+
 class PictureMemory:
     """The pictures used last, within a bound; a file that was changed is read again."""
 
@@ -35,13 +45,10 @@ class PictureMemory:
         self._max_bytes = max_bytes
         self._kept: OrderedDict[tuple[object, ...], Ready] = OrderedDict()
 
-    def ready(self, path: str, mask: str | None = None, store: str | None = None) -> Ready:
-        """The picture of a file, its features kept in the folder `store` if one is given.
-
-        `mask` is a picture of the same size that is not black where this one is to be ignored. Raises ImageReadError.
-        """
-        stamp = (path, _stamp(path), mask, mask and _stamp(mask), store)
-        found = self._kept.pop(stamp, None) or _read(path, mask, store)
+    def ready(self, source: Source, store: str | None = None) -> Ready:
+        """The picture, its features kept in the folder `store` if one is given. Raises ImageReadError."""
+        stamp = (source, _stamp(source.path), source.mask and _stamp(source.mask), store)
+        found = self._kept.pop(stamp, None) or _read(source, store)
         self._kept[stamp] = found
         self._shrink()
         return found
@@ -54,10 +61,10 @@ class PictureMemory:
             total -= oldest.nbytes
 
 
-def _read(path: str, mask: str | None, store: str | None) -> Ready:
-    loaded = read_picture(path)
-    hidden = read_mask(Path(mask), size_of(loaded.pixels)) if mask else None
-    identity = f"{loaded.sha256} {hidden.sha256 if hidden else ''}"
+def _read(source: Source, store: str | None) -> Ready:
+    loaded = read_picture(source.path, source.reading, page=source.page)
+    hidden = read_mask(Path(source.mask), size_of(loaded.pixels)) if source.mask else None
+    identity = f"{loaded.sha256} {source.page} {source.reading.lenient} {hidden.sha256 if hidden else ''}"
     valid = hidden.valid if hidden else None
     recall = recall_from(Path(store), identity) if store else None
     return Ready(loaded=loaded, prepared=prepare(loaded.pixels, valid, recall=recall))

@@ -9,17 +9,24 @@ from autoalign.batch.ledger import LedgerReader
 from autoalign.files.row import Row, Thumbnails
 from autoalign.views.report import write_report
 
-REPORT = "report.html"
+REPORT, RECORDING = "report.html", "batch.rrd"
 
 
-def write_reports(out_dir: Path, ledger: LedgerReader, about: Mapping[str, str], *, sequence: bool) -> Path:
-    """Write the report of all that the ledger knows into the folder of the results, and say where it is.
+def write_reports(
+    out_dir: Path, ledger: LedgerReader, about: Mapping[str, str], *, sequence: bool = False, recorded: bool = False
+) -> list[Path]:
+    """Write the report of all that the ledger knows into the folder of the results, and the recording if it is wanted.
 
-    Raises ImageWriteError if it cannot be written.
+    Says where they are. Raises ImageWriteError if one cannot be written.
     """
-    report = out_dir / REPORT
-    write_report(report, out_dir.absolute().name, _illustrated(ledger), about, sequence=sequence, overwrite=True)
-    return report
+    title, report, recording = out_dir.absolute().name, out_dir / REPORT, out_dir / RECORDING
+    write_report(report, title, _illustrated(ledger), about, sequence=sequence, overwrite=True)
+    if not recorded:
+        return [report]
+    from autoalign.views.viewer_batch import write_batch_recording  # not above: it loads rerun
+
+    write_batch_recording(recording, title, _illustrated(ledger), about, overwrite=True)
+    return [report, recording]
 
 
 def _illustrated(ledger: LedgerReader) -> Iterator[tuple[Row, Thumbnails | None]]:

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from autoalign.batch.jobs import Job
-from autoalign.batch.memory import PictureMemory, Ready
+from autoalign.batch.memory import PictureMemory, Ready, Source
 from autoalign.errors import CanvasError, ImageReadError, ImageWriteError
 from autoalign.files.read import LoadedPicture
 from autoalign.files.record import placed_record, record
@@ -32,10 +32,13 @@ class Task:
 
     def ready(self) -> tuple[Ready, Ready]:
         """The fixed and the moving picture, from the memory of this process if it has them; ImageReadError if not."""
-        return self._ready(self.job.fixed, self.job.fixed_mask), self._ready(self.job.moving, self.job.moving_mask)
+        job, options = self.job, self.job.options
+        fixed = Source(path=job.fixed, mask=job.fixed_mask, page=options.fixed_page, reading=options.reading)
+        moving = Source(path=job.moving, mask=job.moving_mask, page=options.moving_page, reading=options.reading)
+        return self._ready(fixed), self._ready(moving)
 
-    def _ready(self, path: str, mask: str | None) -> Ready:
-        return _memory().ready(path, mask, self.store if path in self.again else None)
+    def _ready(self, source: Source) -> Ready:
+        return _memory().ready(source, self.store if source.path in self.again else None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +89,8 @@ def _memory() -> PictureMemory:
 
 
 def _find(job: Job, fixed: Ready, moving: Ready) -> _Found:
-    drawn = asdict(job.options.drawing)
+    drawn = {name: value for name, value in asdict(job.options).items() if name not in ("align", "recorded")}
+    drawn |= drawn.pop("drawing") | drawn.pop("reading")
     if job.placed is not None:
         return _Found(kept=placed_record(job.placed, fixed.loaded, moving.loaded, job.options.align, drawn=drawn))
     alignment = align(fixed.prepared, moving.prepared, job.options.align)

@@ -24,7 +24,7 @@ from autoalign.batch.telling import write_reports
 from autoalign.cli.progress import clock, following, tally
 from autoalign.cli.running import RUNNING, Running, engine_of, in_words, make_folder
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
-from autoalign.files.read import read_text
+from autoalign.files.read import ReadOptions, read_text
 from autoalign.files.row import Row
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
@@ -70,6 +70,7 @@ def batch(
     files: Annotated[BatchFiles, Parameter(name="*", group=FILES)],
     selection: Annotated[Selection, Parameter(name="*", group=FILES)] = Selection(),
     drawing: Annotated[Drawing, Parameter(name="*", group=FILES)] = Drawing(),
+    reading: Annotated[ReadOptions, Parameter(name="*", group=FILES)] = ReadOptions(),
     again: Annotated[Again, Parameter(name="*", group=RUNNING)] = Again(),
     running: Annotated[Running, Parameter(name="*", group=RUNNING)] = Running(),
     options: Annotated[AlignOptions, Parameter(name="*", group=ALIGNMENT)] = AlignOptions(),
@@ -83,14 +84,14 @@ def batch(
         a folder, or a manifest: CSV with the columns fixed, moving and, if wanted, name and options; - is stdin
     """
     started = time.monotonic()
-    wanted = JobOptions(align=options, drawing=drawing, recorded=files.save_rrd)
+    wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
     jobs, reference = _jobs(source, files, selection, wanted)
     if again.plan:
         return _tell_plan(jobs, reference, files.out_dir)
     make_folder(files.out_dir)
     with Ledger(files.out_dir) as ledger, feature_store(files.out_dir, running.cache) as store:
         engine = engine_of(running)
-        about = {"source": str(source)} | in_words(files, selection, drawing, running, options)
+        about = {"source": str(source)} | in_words(files, selection, drawing, reading, running, options)
         ledger.begin_run(about)
         if reference is not None:
             jobs = _placed(jobs, reference, ledger, engine, store, common)
@@ -102,9 +103,9 @@ def batch(
                 follow(row.status)
         mine = {job.name for job in jobs}
         rows = [row for row in ledger.rows() if row.name in mine]
-        report = write_reports(files.out_dir, ledger, about, sequence=files.sequence)
+        reports = write_reports(files.out_dir, ledger, about, sequence=files.sequence, recorded=True)
     _tell_end(rows, len(jobs), plan.done, time.monotonic() - started, common)
-    note(f"report: {report}", common)
+    note(f"wrote {', '.join(map(str, reports))}", common)
     return _exit(rows, len(jobs))
 
 

@@ -24,7 +24,7 @@ from autoalign.cli.progress import tally
 from autoalign.cli.running import RUNNING, Running, engine_of, in_words, make_folder
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, complain, note, tell
 from autoalign.errors import ImageReadError, ImageWriteError
-from autoalign.files.read import read_picture
+from autoalign.files.read import ReadOptions, read_picture
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
 
@@ -54,6 +54,7 @@ def watch(
     files: Annotated[WatchFiles, Parameter(name="*", group=FILES)],
     selection: Annotated[Selection, Parameter(name="*", group=FILES)] = Selection(),
     drawing: Annotated[Drawing, Parameter(name="*", group=FILES)] = Drawing(),
+    reading: Annotated[ReadOptions, Parameter(name="*", group=FILES)] = ReadOptions(),
     running: Annotated[Running, Parameter(name="*", group=RUNNING)] = Running(),
     options: Annotated[AlignOptions, Parameter(name="*", group=ALIGNMENT)] = AlignOptions(),
     common: Annotated[Common, Parameter(name="*", group=GENERAL)] = Common(),
@@ -67,10 +68,10 @@ def watch(
     """
     if not folder.is_dir():
         raise ImageReadError(f"is no folder: {folder}")
-    read_picture(files.reference)  # a reference that is no good should not be found out at night
+    read_picture(files.reference, reading)  # a reference that is no good should not be found out at night
     make_folder(files.out_dir)
-    wanted = JobOptions(align=options, drawing=drawing, recorded=files.save_rrd)
-    about = {"watched": str(folder)} | in_words(files, selection, drawing, running, options)
+    wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
+    about = {"watched": str(folder)} | in_words(files, selection, drawing, reading, running, options)
     engine, counts = engine_of(running), Counter[str]()
     with (
         Ledger(files.out_dir) as ledger,
@@ -82,7 +83,7 @@ def watch(
         for names in _arriving(folder, selection, files):
             jobs = onto_reference(folder, names, files.reference, files.out_dir, wanted)
             counts.update(_align(jobs, files, ledger, engine, store, common))
-            write_reports(files.out_dir, ledger, about, sequence=False)
+            write_reports(files.out_dir, ledger, about)
     tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing arrived")
     return Exit.DONE if set(counts) <= {"aligned"} else Exit.NOT_ALIGNED
 
