@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from autoalign.geometry.homography import apply, invert
-from autoalign.picture.pixels import check_picture, grey, has_alpha, opaque, resize_map, shrink, size_of, to_8_bit
+from autoalign.picture.pixels import (
+    check_picture,
+    grey,
+    has_alpha,
+    in_colour,
+    opaque,
+    resize_map,
+    shrink,
+    size_of,
+    to_8_bit,
+)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
@@ -109,3 +119,12 @@ def test_shrink_never_loses_a_side(size):
     shrunken = shrink(np.full(size[::-1], 9, np.uint8), 100)
     assert min(size_of(shrunken.pixels)) == 1
     assert (shrunken.pixels == 9).all()
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_in_colour_keeps_alpha_and_its_grey(channels):
+    image = np.random.default_rng(1).integers(0, 256, (5, 7, channels), np.uint8)
+    coloured = in_colour(image[..., 0] if channels == 1 else image)
+    assert coloured.shape == (5, 7, 4 if channels in (2, 4) else 3)
+    np.testing.assert_array_equal(coloured[..., :3], image[..., :3] if channels > 2 else image[..., :1].repeat(3, 2))
+    np.testing.assert_array_equal(coloured[..., 3:], image[..., 1:2] if channels == 2 else image[..., 3:])

@@ -74,13 +74,17 @@ def _read_header(data: bytes) -> Header:
 
 
 def _decode(data: bytes) -> Picture:
-    codestream = _codestream(data)
-    return full_range(imagecodecs.jpeg2k_decode(data), codestream.bits)
+    # Of the codestream alone: a profile that lies around it would be applied to the pixels, and is kept instead.
+    return full_range(imagecodecs.jpeg2k_decode(_stream(data)), _codestream(data).bits)
+
+
+def _stream(data: bytes) -> bytes:
+    return data if data.startswith(CODESTREAM) else next(bodies(data, b"jp2c"), b"")
 
 
 def _codestream(data: bytes) -> Codestream:
     """Raises Refused if its pixels cannot become a picture, struct.error or StopIteration if it makes no sense."""
-    stream = data if data.startswith(CODESTREAM) else next(bodies(data, b"jp2c"), b"")
+    stream = _stream(data)
     right, bottom, left, top = struct.unpack_from(">4I", stream, 8)  # of the picture on its reference grid
     (channels,) = struct.unpack_from(">H", stream, 40)
     if not 1 <= channels <= 4:

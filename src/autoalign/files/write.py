@@ -13,7 +13,7 @@ from autoalign.errors import ImageWriteError
 from autoalign.files.codec import one_line
 from autoalign.files.formats import FORMATS, Format, default_for, encoder_for, of_name
 from autoalign.files.metadata import Metadata, describing
-from autoalign.picture.pixels import Picture, check_picture, has_alpha, size_of
+from autoalign.picture.pixels import Picture, check_picture, has_alpha, in_colour, size_of
 
 TEMPORARY = ".autoalign-{}.tmp"  # name of a file that is being written
 NEW_FILE_MODE = 0o666  # less what the umask takes, as for every file that a program makes
@@ -42,6 +42,8 @@ def write_picture(
     check_writable(path, overwrite)
     if pixels.ndim == 3 and pixels.shape[2] == 1:
         pixels = pixels[..., 0]
+    if not format.grey:
+        pixels = in_colour(pixels)
     try:
         data = encoder_for(format, jpeg_quality)(pixels, describing(metadata or Metadata(), pixels))
     except Exception as error:  # encoders raise what they like: memory, their own limits

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from autoalign.picture.pixels import Picture, check_picture, grey, has_alpha, opaque
+from autoalign.picture.pixels import Picture, check_picture, grey, has_alpha, in_colour, opaque
 
 Pixels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -47,7 +47,7 @@ def compose(
     fixed_data, moving_data = _data(fixed, fixed_valid), _data(moving, moving_valid)
     fixed_shown, moving_shown = _shown(fixed, fixed_data), _shown(moving, moving_data)
     if fixed_shown.ndim != moving_shown.ndim:
-        fixed_shown, moving_shown = _rgb(fixed_shown), _rgb(moving_shown)
+        fixed_shown, moving_shown = in_colour(fixed_shown), in_colour(moving_shown)
     return STYLES[style](fixed_shown, moving_shown, fixed_data, moving_data)
 
 
@@ -152,10 +152,6 @@ def _exposed_like(model: Pixels, picture: Pixels, sample: Pixels) -> Pixels:
     gain = float(np.clip(model.std() / max(sample.std(), 1.0), 1 / MAX_GAIN, MAX_GAIN))
     levels = np.rint((np.arange(256) - sample.mean()) * gain + model.mean())
     return np.asarray(cv2.LUT(picture, np.clip(levels, 0, 255).astype(np.uint8)), np.uint8)
-
-
-def _rgb(picture: Pixels) -> Pixels:
-    return np.stack([picture] * 3, axis=-1) if picture.ndim == 2 else picture
 
 
 def _chosen(mask: Mask, where: Picture, elsewhere: Pixels | None = None) -> Pixels:

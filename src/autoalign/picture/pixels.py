@@ -90,6 +90,15 @@ def grey(image: Picture) -> Picture:
     return np.asarray(cv2.cvtColor(image, code))
 
 
+def in_colour(image: Picture) -> Picture:
+    """(h, w, 3) or (h, w, 4): grey repeated for red, green and blue, alpha kept; what is RGB comes back as it is."""
+    if image.ndim == 3 and image.shape[2] > 2:
+        return image
+    if image.ndim == 2:
+        return np.stack([image] * 3, axis=-1)
+    return np.concatenate([image[..., :1]] * 3 + [image[..., 1:]], axis=-1)
+
+
 def to_8_bit(image: Picture) -> NDArray[np.uint8]:
     """(h, w) grey as uint8: 8-bit as it is, others stretched between their 0.1 and 99.9 percentiles.
 

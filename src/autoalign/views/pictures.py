@@ -15,7 +15,7 @@ from autoalign.files.row import Thumbnails
 from autoalign.geometry.homography import Array, jacobian, scaling, translation
 from autoalign.geometry.uncertainty import overlap_points
 from autoalign.picture.compose import compose
-from autoalign.picture.pixels import Picture, has_alpha, opaque, shrink, size_of, to_8_bit
+from autoalign.picture.pixels import Picture, has_alpha, in_colour, opaque, shrink, size_of, to_8_bit
 from autoalign.picture.warp import warp
 
 MAX_SIDE = 8192  # px; the textures of many a graphics card and of every browser end here
@@ -158,7 +158,7 @@ def _in_one_frame(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> 
     small_from_fixed = np.linalg.inv(still.full_from_small)
     moved = warp(mover.pixels, size_of(still.pixels), small_from_fixed @ fixed_from_moving @ mover.full_from_small)
     # Side by side they become alike: 8-bit and free of alpha.
-    both = _rgb(compose("side-by-side", still.pixels, moved.pixels, None, moved.valid))
+    both = in_colour(compose("side-by-side", still.pixels, moved.pixels, None, moved.valid))
     a, b = both[:, : both.shape[1] // 2], both[:, both.shape[1] // 2 :]
     seen = opaque(moved.pixels)
     return _Both(fixed=a, moving=b, valid=moved.valid if seen is None else moved.valid & seen)
@@ -192,10 +192,6 @@ def _squeeze(fixed: Picture, moving: Picture, fixed_from_moving: Array) -> float
         return 1.0
     zoom = float(np.median(np.sqrt(np.abs(np.linalg.det(jacobian(fixed_from_moving, inside))))))
     return float(np.clip(max(1.0, (w * h / LAYER_PIXELS) ** 0.5) / max(zoom, 1e-6), 1.0, 64.0))
-
-
-def _rgb(pixels: _Pixels) -> _Pixels:
-    return np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels
 
 
 def _tinted(pixels: _Pixels) -> _Pixels:
