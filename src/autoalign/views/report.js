@@ -74,11 +74,9 @@ function chosen() {
 const cells = {
   order: (row) => [row.order],
   thumbnails: (row) =>
-    row.thumbnails ? row.thumbnails.slice(1).filter((number) => number !== null).map((number) => picture(number)) : [],
-  name: (row) => [opener(row), ...(row.status === "aligned" ? [] : [made("div", { className: "why", dir: "auto" }, row.reason)])],
-  status: (row) => [
-    made("span", { className: `status ${row.status}` }, marks[row.status], made("span", { className: "word" }, ` ${row.status}`)),
-  ],
+    (row.thumbnails ?? []).slice(1).flatMap((number) => (number === null ? [] : [picture(number)])),
+  name: (row) => (row.status === "aligned" ? [opener(row)] : [opener(row), why(row)]),
+  status: (row) => [status(row)],
   expected_error_px: (row) => [digits(row.expected_error_px, " px")],
   inliers: (row) => [digits(row.inliers)],
   matches: (row) => [digits(row.matches)],
@@ -91,6 +89,15 @@ function opener(row) {
   const button = made("button", { type: "button", className: "link", dir: "auto" }, row.name);
   button.setAttribute("aria-expanded", view.open.has(row.order));
   return button;
+}
+
+function why(row) {
+  return made("div", { className: "why", dir: "auto" }, row.reason);
+}
+
+function status(row) {
+  const word = made("span", { className: "word" }, ` ${row.status}`);
+  return made("span", { className: `status ${row.status}` }, marks[row.status], word);
 }
 
 function line(row) {
@@ -166,17 +173,19 @@ function looks(row) {
 }
 
 function framed(before) {
-  return made("figure", {}, picture(before, "The moving picture"), made("figcaption", {}, "moving; there is no transform to lay it by"));
+  const caption = made("figcaption", {}, "moving; there is no transform to lay it by");
+  return made("figure", {}, picture(before, "The moving picture"), caption);
 }
 
 function slider(row, fixed, before, after) {
   const above = picture(after, "The moving picture after alignment");
   const range = made("input", { type: "range", min: 0, max: 100, value: 50 });
-  range.setAttribute("aria-label", "Left of this share of the width before, right of it after");
+  range.setAttribute("aria-label", "Where before ends and after begins, percent of the width");
   const left = made("span", { className: "tag left" }, "before");
   const right = made("span", { className: "tag right" }, "after");
   const handle = made("span", { className: "handle" });
-  const compare = made("div", { className: "compare" }, picture(before, "The moving picture before alignment"), above, handle, left, right, range);
+  const below = picture(before, "The moving picture before alignment");
+  const compare = made("div", { className: "compare" }, below, above, handle, left, right, range);
   range.addEventListener("input", () => compare.style.setProperty("--at", `${range.value}%`));
 
   const button = made("button", { type: "button", className: "blink" }, "Blink");
@@ -202,7 +211,8 @@ function slider(row, fixed, before, after) {
     show(true, turn);
     timer = setInterval(() => (button.isConnected ? show(true, (turn = 1 - turn)) : stop()), BLINK_MS);
   });
-  const trust = row.status === "aligned" ? "drag, or use the arrow keys; dark is fixed alone" : `as laid by a transform that is ${row.status}`;
+  const how = "drag, or use the arrow keys; dark is fixed alone";
+  const trust = row.status === "aligned" ? how : `as laid by a transform that is ${row.status}`;
   const under = made("div", { className: "under" }, made("figcaption", {}, trust), button);
   return made("figure", {}, compare, under);
 }
@@ -230,7 +240,8 @@ function draw() {
     if (view.open.delete(row.order)) toggle(row, byId("rows").querySelectorAll("tr.row")[place]);
   }
   if (!page.length) {
-    byId("rows").append(made("tr", { className: "none" }, made("td", { colSpan: heads.length }, "No pair is as asked for.")));
+    const told = made("td", { colSpan: heads.length }, "No pair is as asked for.");
+    byId("rows").append(made("tr", { className: "none" }, told));
   }
 }
 

@@ -40,7 +40,6 @@ _COPIED = 1 << 20  # bytes
 _PER_SECOND = 2.0  # pairs, when the time bar plays
 _WITH_ERRORS: tuple[RowStatus, ...] = ("aligned", "doubtful")
 _WITH_MATCHES: tuple[RowStatus, ...] = ("aligned", "doubtful", "rejected")
-
 _PICTURES = ("fixed", "before", "after")  # fields of thumbnails
 
 Illustrated = tuple[Row, Thumbnails | None]
@@ -67,20 +66,20 @@ def write_batch_recording(
         made = Path(folder) / "batch.rrd"
         recording = quiet_recording(BATCH_APPLICATION, _recording_id(title, about))
         recording.save(made)
-        recording.send_blueprint(_blueprint())  # first: a viewer that waits for it guesses a layout of its own
-        recording.send_recording_name(plain(title))
-        _log_styles(recording)
-        _log_summary(recording, title, about, _log_rows(recording, rows, seconds))
-        recording.flush()
-        recording.disconnect()  # which writes the footer
+        try:
+            recording.send_blueprint(_blueprint())  # first: a viewer that waits for it guesses a layout of its own
+            recording.send_recording_name(plain(title))
+            _log_styles(recording)
+            _log_summary(recording, title, about, _log_rows(recording, rows, seconds))
+        finally:
+            recording.disconnect()  # which writes the footer
         with made.open("rb") as file:
             for part in iter(partial(file.read, _COPIED), b""):
                 write(part)
 
 
 def _recording_id(title: str, about: Mapping[str, str]) -> str:
-    what = repr((__version__, title, dict(about))).encode("utf-8", "surrogateescape")
-    return hashlib.sha256(what).hexdigest()[:32]
+    return hashlib.sha256(repr((__version__, title, dict(about))).encode()).hexdigest()[:32]
 
 
 def _log_rows(
