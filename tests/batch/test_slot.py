@@ -28,7 +28,9 @@ def slot(function: Any, **terms: Any) -> Iterator[Slot[Any, Any]]:
 def test_a_worker_killed_between_jobs_costs_no_job() -> None:
     with slot(doomed.doze) as there:
         first = there.run(0.0)
-        psutil.Process(first.result).kill()
+        worker = psutil.Process(first.result)
+        worker.kill()
+        psutil.wait_procs([worker], timeout=5)
         second = there.run(0.0)
     assert (first.casualty, second.casualty) == (None, None)
     assert first.result != second.result
