@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from cyclopts import Group, Parameter
 
@@ -14,6 +15,9 @@ FILES, ALIGNMENT, GENERAL = Group("Files", sort_key=1), Group("Alignment", sort_
 
 STYLE_OF = {"aligned": "bold green", "doubtful": "bold yellow", "rejected": "bold red", "failed": "bold magenta"}
 """Verdicts as the terminal shows them."""
+
+
+T = TypeVar("T")
 
 
 class Exit(IntEnum):
@@ -53,6 +57,23 @@ def note(text: str, common: Common) -> None:
     """A line on stderr about what was done, unless -q."""
     if not common.quiet:
         tell(text, to_stderr=True)
+
+
+def progress(what: str, common: Common) -> Callable[[Iterator[T], int], Iterator[T]]:
+    """What passes on things one by one, of which there will be so many, and shows on a terminal how far it has come.
+
+    Nothing is shown with -q, or where stderr is no terminal.
+    """
+
+    def watched(things: Iterator[T], total: int) -> Iterator[T]:
+        from rich.console import Console
+        from rich.progress import Progress
+
+        console = Console(stderr=True)
+        with Progress(console=console, transient=True, disable=common.quiet or not console.is_terminal) as bar:
+            yield from bar.track(things, total=total, description=what)
+
+    return watched
 
 
 def complain(text: str) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from autoalign import __version__
-from autoalign.files.read import LoadedPicture
+from autoalign.files.large import AnyPicture
 from autoalign.files.sidecar import PictureRecord, Sidecar, as_shown
 from autoalign.picture.pixels import size_of
 from autoalign.registration.alignment import Alignment, AlignOptions
@@ -21,8 +21,8 @@ from autoalign.registration.sequence import SequenceFrame
 
 def record(
     alignment: Alignment,
-    fixed: LoadedPicture,
-    moving: LoadedPicture,
+    fixed: AnyPicture,
+    moving: AnyPicture,
     *,
     drawn: Mapping[str, Any] | None = None,
     timings: bool = False,
@@ -50,8 +50,8 @@ def record(
 
 def placed_record(
     frame: SequenceFrame,
-    fixed: LoadedPicture,
-    moving: LoadedPicture,
+    fixed: AnyPicture,
+    moving: AnyPicture,
     options: AlignOptions,
     *,
     drawn: Mapping[str, Any],
@@ -83,7 +83,7 @@ def versions() -> dict[str, str]:
     }
 
 
-def _remarks(fixed: LoadedPicture, moving: LoadedPicture) -> dict[str, Any]:
+def _remarks(fixed: AnyPicture, moving: AnyPicture) -> dict[str, Any]:
     """What had to be overlooked to read the files; nothing where nothing had."""
     said = {name: loaded.remark for name, loaded in (("fixed", fixed), ("moving", moving)) if loaded.remark}
     return {"reading": said} if said else {}
@@ -98,5 +98,5 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _picture(loaded: LoadedPicture) -> PictureRecord:
+def _picture(loaded: AnyPicture) -> PictureRecord:
     return PictureRecord(name=loaded.path.name, size=size_of(loaded.pixels), sha256=loaded.sha256)

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from autoalign.files.metadata import on_grid_of
 from autoalign.files.read import LoadedPicture
 from autoalign.files.write import write_picture
 from autoalign.geometry.homography import Array
 from autoalign.picture.compose import compose
-from autoalign.picture.pixels import opaque, size_of
+from autoalign.picture.pixels import Picture, opaque, size_of
 from autoalign.picture.warp import Warped, warp
 from autoalign.registration.drawing import Drawing, Drawn, draw
 
@@ -52,23 +53,28 @@ def write_result(
         write_mask(files.mask, drawn.warped, overwrite)
         written.append(files.mask)
     if files.overlay is not None:
-        _write_overlay(files.overlay, files.overlay_style, fixed, drawn, overwrite)
+        write_overlay(files.overlay, files.overlay_style, fixed.pixels, drawn, overwrite)
         written.append(files.overlay)
     return written
 
 
 def write_mask(path: Path, warped: Warped, overwrite: bool = False) -> None:
-    """Where a result has data, as a grey picture: white, and black where it has none or is wholly see-through.
+    """Write where a result has data, as `seen_in` shows it. Raises ImageWriteError as `write_picture` does."""
+    write_picture(path, seen_in(warped), overwrite=overwrite)
+
+
+def seen_in(warped: Warped) -> NDArray[np.uint8]:
+    """(h, w) white where a result has data, black where it has none or is wholly see-through."""
+    seen = opaque(warped.pixels)
+    data = warped.valid if seen is None else warped.valid & seen
+    return np.asarray(data * np.uint8(255))
+
+
+def write_overlay(path: Path, style: str, fixed: Picture, drawn: Drawn, overwrite: bool = False) -> None:
+    """Write both pictures as one, in the frame that the moving one was drawn in.
 
     Raises ImageWriteError as `write_picture` does.
     """
-    seen = opaque(warped.pixels)
-    data = warped.valid if seen is None else warped.valid & seen
-    write_picture(path, data * np.uint8(255), overwrite=overwrite)
-
-
-def _write_overlay(path: Path, style: str, fixed: LoadedPicture, drawn: Drawn, overwrite: bool) -> None:
-    """Both pictures as one, in the frame that the moving one was drawn in."""
-    still, moved = warp(fixed.pixels, drawn.frame.size, drawn.frame.canvas_from_fixed), drawn.warped
+    still, moved = warp(fixed, drawn.frame.size, drawn.frame.canvas_from_fixed), drawn.warped
     both = compose(style, still.pixels, moved.pixels, still.valid, moved.valid)
     write_picture(path, both, overwrite=overwrite)

@@ -29,8 +29,6 @@ from autoalign.files.metadata import Metadata, describing
 from autoalign.files.read import check_size, opened
 from autoalign.picture.pixels import Picture, PixelSource, Shrunken, resize_map, size_of, working_copy
 
-LARGE_PIXELS = 100e6  # a TIFF with more is read box by box
-MAX_PIXELS = 2**30  # of a picture that is read so
 CACHE_BYTES = 192 * 2**20  # of decoded tiles: a strip of a turned gigapixel passes through some hundred of them
 THREADS = 2  # that decode; more would only wait for the warper
 MAX_TILE_PIXELS = 2**25  # a page in larger pieces is not read box by box
@@ -51,6 +49,7 @@ class LargePicture:
     sha256: str  # of the file's bytes, 64 hexadecimal digits
     format: str
     path: Path
+    remark: str | None = None  # nothing is overlooked
 
     def working_copy(self, max_pixels: float) -> Shrunken:
         """The picture made smaller to at most `max_pixels`, from the smallest overview that has more, if there is one.
@@ -153,7 +152,7 @@ class TiledPixels:
 
 @contextmanager
 def opened_large(
-    path: str | Path, *, above_pixels: float = LARGE_PIXELS, max_pixels: float = MAX_PIXELS, number: int = 0
+    path: str | Path, *, above_pixels: float, max_pixels: float, number: int = 0
 ) -> Iterator[LargePicture | None]:
     """A page of a TIFF with more than `above_pixels` pixels, open to be read box by box; None for anything else.
 

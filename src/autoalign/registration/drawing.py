@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from autoalign.geometry.homography import Array
+from autoalign.geometry.homography import Array, translation
 from autoalign.picture.border import Border, bordered
 from autoalign.picture.canvas import Canvas, CanvasKind, canvas
-from autoalign.picture.pixels import Picture, size_of
+from autoalign.picture.pixels import Picture, PixelSource, size_of
 from autoalign.picture.warp import Interpolation, Warped, warp
 from autoalign.registration.alignment import Alignment
 
@@ -18,7 +18,7 @@ class Drawing:
     """How the moving picture is drawn."""
 
     canvas: CanvasKind = "fixed"
-    """frame of the result: FIXED's own, one that holds both, their overlap, the largest box inside it, or all of MOVING"""
+    """frame of the result: FIXED's own, one with both, their overlap, the largest full box in it, or all of MOVING"""
     border: Border = "constant"
     """where there is no data: see-through, which needs alpha; black; or the nearest pixel repeated"""
 
@@ -46,6 +46,26 @@ def draw(
     frame = canvas(drawing.canvas, fixed_size, size_of(moving), fixed_from_moving)
     warped = warp(moving, frame.size, frame.canvas_from_fixed @ fixed_from_moving, interpolation=interpolation)
     return Drawn(warped=replace(warped, pixels=bordered(warped, drawing.border)), frame=frame)
+
+
+def draw_in_strips(
+    moving: PixelSource,
+    size: tuple[int, int],
+    canvas_from_moving: Array,
+    drawing: Drawing,
+    rows: int,
+    interpolation: Interpolation = "linear",
+) -> Iterator[Warped]:
+    """The moving picture drawn in a frame of `size` (w, h), `rows` rows at a time, from the top to the bottom.
+
+    Raises ValueError for a border that no strip has all of what it needs for.
+    """
+    if drawing.border == "replicate":
+        raise ValueError("the nearest pixel with data may lie in another strip")
+    for y in range(0, size[1], rows):
+        strip_from_moving = translation(0, -y) @ canvas_from_moving
+        warped = warp(moving, (size[0], min(rows, size[1] - y)), strip_from_moving, interpolation=interpolation)
+        yield replace(warped, pixels=bordered(warped, drawing.border))
 
 
 def warp_onto_fixed(

@@ -43,9 +43,9 @@ def align_large(
 ) -> Alignment:
     """As `align`, for pictures of which only patches are read at their full size; the masks are those of the copies.
 
-    The alignment is told in pixels of the full pictures, and its expected error is that of patches compared there. Where
-    these did not prove better, it is that of the copies, as many times larger as they are smaller. What reading raises
-    goes through.
+    The alignment is told in pixels of the full pictures, and its expected error is that of patches compared there.
+    Where these did not prove better, it is that of the copies, as many times larger as they are smaller. What reading
+    raises goes through.
     """
     options = options or AlignOptions()
     small = align(fixed.copy.pixels, moving.copy.pixels, options, fixed_valid=fixed_valid, moving_valid=moving_valid)
