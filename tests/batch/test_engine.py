@@ -161,6 +161,15 @@ def test_no_worker_outlives_its_coordinator(tmp_path: Path, end: signal.Signals)
     assert alive == []
 
 
+def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
+    """Each of its workers would run the script again."""
+    script = tmp_path / "careless.py"
+    script.write_text("from autoalign.batch.engine import LocalEngine\nlist(LocalEngine(workers=1).run(abs, [-1]))\n")
+    ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert 'must do so under `if __name__ == "__main__":`' in ended.stderr.splitlines()[-1]
+
+
 @pytest.mark.parametrize("engine", [InlineEngine(), LocalEngine(workers=2)])
 def test_engines_give_the_same(engine: Engine) -> None:
     outcomes = by_job(engine.run(doomed.fall, ["error", "one", "two", "sys.exit"]))

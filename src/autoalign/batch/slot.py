@@ -131,15 +131,19 @@ class Slot(Generic[J, R]):
                 return self._worker
             self._worker.end()
         for _ in range(START_ATTEMPTS):
-            with _BIRTHS_AND_DEATHS:
-                if self._stopped:
-                    raise EngineError("the engine was stopped")
-                worker = self._worker = _Worker(self._terms)
+            try:
+                with _BIRTHS_AND_DEATHS:
+                    if self._stopped:
+                        raise EngineError("the engine was stopped")
+                    worker = self._worker = _Worker(self._terms)
+            except (EOFError, OSError) as error:  # the server that workers come from has ended
+                reason = one_line(error)
+                continue
             if worker.greets():
                 return worker
-            casualty = worker.death()
+            reason = worker.death().reason
         raise EngineError(
-            f"no worker can be started: {casualty.reason}, and what it said before stands above"
+            f"no worker can be started: {reason}, and what it said before stands above"
             ' (a script that runs a batch must do so under `if __name__ == "__main__":`)'
         )
 
@@ -235,7 +239,7 @@ def _context(function: Callable[..., Any]) -> BaseContext:
         return mp.get_context("spawn")
     context = mp.get_context("forkserver")
     named = function.func if isinstance(function, functools.partial) else function
-    context.set_forkserver_preload([__name__, named.__module__])  # heard only by the first start in this process
+    context.set_forkserver_preload(["__main__", __name__, named.__module__])  # heard by the first start only
     return context
 
 
