@@ -115,7 +115,6 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "apply",
             "batch",
             "watch",
-            "status",
             "main",
         )
     },
@@ -147,7 +146,6 @@ HOMES: dict[str, tuple[str, ...]] = {
         "cli.batch",
         "cli.running",
         "cli.watch",
-        "cli.status",
         "cli.view",
         "cli.main",
     ),

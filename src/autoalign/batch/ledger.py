@@ -129,6 +129,10 @@ class LedgerReader:
         """What `keep_link` was given; None if that is nothing."""
         return next((data for (data,) in self._found("SELECT data FROM link WHERE key = ?", key)), None)
 
+    def seconds(self) -> dict[str, float]:
+        """How long each job took, by name."""
+        return dict(self._found("SELECT name, seconds FROM result JOIN job USING (key)"))
+
     def runs(self) -> list[Run]:
         """Oldest first."""
         found = self._found("SELECT started, ended, version, options FROM run ORDER BY rowid")

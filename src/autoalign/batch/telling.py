@@ -20,12 +20,14 @@ def write_reports(
     Says where they are. Raises ImageWriteError if one cannot be written.
     """
     title, report, recording = out_dir.absolute().name, out_dir / REPORT, out_dir / RECORDING
+    about = {"results": str(out_dir.absolute()), **about}
     write_report(report, title, _illustrated(ledger), about, sequence=sequence, overwrite=True)
     if not recorded:
         return [report]
     from autoalign.views.viewer_batch import write_batch_recording  # not above: it loads rerun
 
-    write_batch_recording(recording, title, _illustrated(ledger), about, overwrite=True)
+    took = ledger.seconds()
+    write_batch_recording(recording, title, _illustrated(ledger), about, seconds=took.get, overwrite=True)
     return [report, recording]
 
 

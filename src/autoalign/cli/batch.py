@@ -64,7 +64,7 @@ class Again:
 
 
 def batch(
-    source: Path,
+    source: Annotated[Path, Parameter(allow_leading_hyphen=True)],
     /,
     *,
     files: Annotated[BatchFiles, Parameter(name="*", group=FILES)],

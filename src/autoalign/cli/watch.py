@@ -84,7 +84,7 @@ def watch(
             jobs = onto_reference(folder, names, files.reference, files.out_dir, wanted)
             counts.update(_align(jobs, files, ledger, engine, store, common))
             write_reports(files.out_dir, ledger, about)
-    tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing arrived")
+    tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing new arrived")
     return Exit.DONE if set(counts) <= {"aligned"} else Exit.NOT_ALIGNED
 
 
@@ -95,13 +95,13 @@ def _arriving(folder: Path, selection: Selection, files: WatchFiles) -> Iterator
     with hints(folder, arrivals, recursive=selection.recursive) as hint:
         while True:
             hint.clear()  # before the look: what comes during it is seen at the next one
-            names = arrivals.take()
-            if names:
+            if names := arrivals.take():
                 yield names
                 idle_since = time.monotonic()
-            elif files.until_idle is not None and time.monotonic() - idle_since > files.until_idle:
+            waiting, idle_s = arrivals.waiting(), time.monotonic() - idle_since
+            if files.until_idle is not None and not waiting and idle_s > files.until_idle:
                 return
-            hint.wait(UNSETTLED_S if arrivals.waiting() or files.until_idle is not None else files.rescan)
+            hint.wait(UNSETTLED_S if waiting or files.until_idle is not None else files.rescan)
 
 
 def _align(

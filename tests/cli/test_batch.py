@@ -1,0 +1,131 @@
+"""`autoalign batch` and `autoalign watch` as people call them."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import autoalign as aa
+from autoalign.cli.progress import clock, following, tally
+
+
+@pytest.fixture
+def shots(pictures: Path) -> Path:
+    """in/ with the examples and a picture that is none; the working folder is the one above."""
+    (pictures / "in").mkdir()
+    for name in ("fixed.jpg", "moving.jpg"):
+        (pictures / name).rename(pictures / "in" / name)
+    (pictures / "in" / "torn.jpg").write_bytes((pictures / "in" / "moving.jpg").read_bytes()[:9000])
+    return pictures
+
+
+def test_a_folder_onto_a_reference(shots, run):
+    words = ("batch", "in", "--reference", "in/fixed.jpg", "--out-dir", "out", "--workers", "1")
+    first = run(*words)
+    assert first.code == 3  # torn.jpg
+    assert first.out.startswith("2 pairs: 1 aligned, 1 failed (0:")
+    assert "failed torn.jpg: is damaged" in first.err
+    assert "wrote out/report.html, out/batch.rrd" in first.err
+    assert json.loads((shots / "out" / "moving.jpg.autoalign.json").read_text())["status"] == "aligned"
+    assert aa.read_picture(shots / "out" / "moving.jpg").pixels.shape == aa.read_picture("in/fixed.jpg").pixels.shape
+    assert "torn.jpg" in (shots / "out" / "report.html").read_text()
+    assert (shots / "out" / "batch.rrd").read_bytes().startswith(b"RRF")
+    second = run(*words, "--exclude", "torn*")
+    assert (second.code, second.err.count("\n")) == (0, 1)
+    assert second.out.startswith("1 pairs: 1 aligned, 1 of them done before (0:")
+
+
+def test_a_plan_does_nothing(shots, run):
+    planned = run("batch", "in", "--reference", "in/fixed.jpg", "--out-dir", "out", "--plan")
+    assert planned.code == 0
+    assert "in/moving.jpg -> in/fixed.jpg: out/moving.jpg\n" in planned.out
+    assert planned.out.endswith("2 pairs; 0 were done before, and only those that changed will be done again\n")
+    assert not (shots / "out").exists()
+    chained = run("batch", "in", "--sequence", "--out-dir", "out", "--plan")
+    assert "3 pairs, after 3 links between frames; 0 were" in chained.out
+
+
+def test_a_manifest_from_standard_input(shots, run, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("fixed,moving,name\nin/fixed.jpg,in/moving.jpg,here/it.png\n"))
+    outcome = run("batch", "-", "--out-dir", "out", "-q")
+    assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
+    assert aa.read_picture(shots / "out" / "here" / "it.png").format == "PNG"
+
+
+def test_a_sequence_goes_onto_one_frame_which_is_among_the_results(folder, run):
+    (folder / "in").mkdir()
+    scene = np.random.default_rng(0).integers(0, 256, (80, 100), np.uint8).repeat(4, 0).repeat(4, 1)
+    for k in range(4):
+        aa.write_picture(
+            folder / "in" / f"f{k}.png", np.ascontiguousarray(scene[3 * k : 3 * k + 240, 7 * k :][:, :320])
+        )
+    outcome = run("batch", "in", "--sequence", "--out-dir", "out", "--workers", "1")
+    assert outcome.code == 0
+    assert outcome.out.startswith("4 pairs: 4 aligned")
+    for k in range(4):
+        kept = aa.read_sidecar(folder / "out" / f"f{k}.png.autoalign.json")
+        shift = np.array(kept.fixed_from_moving)
+        assert np.allclose(shift, [[1, 0, 7 * k], [0, 1, 3 * k], [0, 0, 1]], atol=0.03)
+    assert np.array_equal(aa.read_picture("out/f0.png").pixels, aa.read_picture("in/f0.png").pixels)
+    again = run("batch", "in", "--sequence", "--out-dir", "out", "--workers", "1")
+    assert "4 of them done before" in again.out
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (("in",), 2, "needs --reference FILE, --sequence or --pattern for a folder: in"),
+        (("in", "--sequence", "--pattern", "x"), 2, "--sequence and --pattern exclude each other"),
+        (("in", "--sequence", "--reference", "elsewhere.jpg"), 2, "is none of the frames of in: elsewhere.jpg"),
+        (("in", "--sequence", "--save-rrd", "all"), 2, "--save-rrd is for pairs"),
+        (("list.csv", "--recursive"), 2, "--recursive is for folders, and this is a manifest: list.csv"),
+        (("list.csv",), 3, "is no manifest (lacks the column moving): list.csv"),
+        (("nowhere.csv",), 3, "does not exist: nowhere.csv"),
+        (("in", "--reference", "in/fixed.jpg", "--max-memory", "-1"), 2, "memory limit"),
+        (("in", "--reference", "in/fixed.jpg", "--workers", "0"), 2, "worker"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(shots, run, words, code, message):
+    (shots / "list.csv").write_text("fixed\na.png\n")
+    outcome = run("batch", *words, "--out-dir", "out")
+    assert (outcome.code, outcome.err.count("\n")) == (code, 1)
+    assert message in outcome.err
+
+
+def test_a_folder_for_results_that_cannot_be(shots, run):
+    (shots / "out").write_text("a file")
+    outcome = run("batch", "in", "--reference", "in/fixed.jpg", "--out-dir", "out")
+    assert (outcome.code, outcome.err.count("\n")) == (3, 1)
+    assert "cannot be made a folder for the results" in outcome.err
+
+
+def test_watching_until_nothing_comes(shots, run):
+    words = ("--reference", "in/fixed.jpg", "--out-dir", "out", "--until-idle", "0.1", "--workers", "1")
+    first = run("watch", "in", *words)
+    assert first.code == 1
+    assert "aligned moving.jpg:" in first.out
+    assert "failed torn.jpg: is damaged" in first.out
+    assert first.out.endswith("2 pairs: 1 aligned, 1 failed\n")
+    assert (shots / "out" / "report.html").exists()
+    second = run("watch", "in", *words)
+    assert (second.code, second.out) == (0, "nothing new arrived\n")
+    assert run("watch", "nowhere", *words).code == run("watch", "in", *("--reference", "x.png", *words[2:])).code == 3
+
+
+def test_plain_lines_where_there_is_no_terminal(capsys):
+    with following("pairs", 2, quiet=False) as follow:
+        follow("aligned")
+        follow("rejected")
+    assert capsys.readouterr().err.startswith("pairs 2 of 2: 1 aligned, 1 rejected, ")
+    with following("pairs", 1, quiet=True) as follow:
+        follow("aligned")
+    assert capsys.readouterr().err == ""
+
+
+def test_words():
+    assert tally({"rejected": 1200, "aligned": 3, "doubtful": 0}) == "3 aligned, 1,200 rejected"
+    assert [clock(seconds) for seconds in (0.4, 61, 3599.7, 3661)] == ["0:00", "1:01", "1:00:00", "1:01:01"]
