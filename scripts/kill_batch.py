@@ -60,8 +60,8 @@ def make_pictures(folder: Path, count: int, rng: np.random.Generator) -> None:
         aa.write_picture(folder / f"p{k}.png", np.ascontiguousarray(scene[y : y + h, x : x + w]))
 
 
-def start(folder: Path, name: str, workers: int) -> subprocess.Popen[bytes]:
-    words = ["batch", "in", "--reference", "in/p0.png", "--out-dir", name, "--workers", str(workers), "--quiet"]
+def start(folder: Path, name: str, workers: int, *more: str) -> subprocess.Popen[bytes]:
+    words = ["batch", "in", "--reference", "in/p0.png", "--out-dir", name, "--workers", str(workers), "--quiet", *more]
     return subprocess.Popen([sys.executable, "-m", "autoalign.cli.main", *words], cwd=folder, stderr=subprocess.DEVNULL)
 
 
@@ -94,12 +94,7 @@ def kill_workers(folder: Path, options: argparse.Namespace, seconds: float, rng:
             killed += 1
     process.wait()
     print(f"workers killed: {killed}", flush=True)
-    subprocess.run(
-        [sys.executable, "-m", "autoalign.cli.main", "batch", "in", "--reference", "in/p0.png", "--out-dir", "workers"]
-        + ["--retry", "failed", "--quiet"],
-        cwd=folder,
-        stderr=subprocess.DEVNULL,
-    )
+    start(folder, "workers", options.workers, "--retry", "failed").wait()
 
 
 def descendants(pid: int) -> list[psutil.Process]:
