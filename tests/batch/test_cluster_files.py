@@ -71,6 +71,6 @@ def test_dask_knows_the_options_that_are_used(path: Path) -> None:
     text = re.sub(r"[\[\],]", "", path.read_text())  # lists in YAML
     for command, program in (("scheduler", dask_scheduler), ("worker", dask_worker)):
         known = {name for option in program.main.params for name in (*option.opts, *option.secondary_opts)}
-        lines = re.findall(rf"dask {command} .*", text)
+        lines = re.findall(rf"dask {command}.*", text)
         assert lines, command
         assert {option for line in lines for option in re.findall(r"(?<!\S)--[a-z-]+", line)} <= known
