@@ -115,6 +115,7 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "apply",
             "batch",
             "watch",
+            "status",
             "main",
         )
     },
@@ -146,6 +147,7 @@ HOMES: dict[str, tuple[str, ...]] = {
         "cli.batch",
         "cli.running",
         "cli.watch",
+        "cli.status",
         "cli.view",
         "cli.main",
     ),

@@ -43,6 +43,13 @@ says of results, records, report and ledger holds here, too: started again, it g
 
 Exit code: 0 all aligned, 1 some are not, 2 wrong usage, 3 the folder or the reference cannot be read.
 """,
+    "status": """\
+Say how far a batch is, and name those pairs that need a person most.
+
+OUT_DIR is the --out-dir of `autoalign batch` or `watch`, which may be at work meanwhile.
+
+Exit code: 0 done, 2 wrong usage, 3 there is no batch, or a file could not be written.
+""",
     "rectify": """\
 Show a plane in IMAGE upright and to scale, from four or more points on it.
 
