@@ -15,8 +15,10 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
@@ -179,7 +181,8 @@ class _Worker:
         self.line, far_end = context.Pipe()
         # Daemonic: it may not outlive this process, and has no children.
         self.process: BaseProcess = context.Process(target=_work, args=(far_end, terms), daemon=True)  # type: ignore[attr-defined]
-        self.process.start()
+        with _out_of_reach_of_ctrl_c():
+            self.process.start()
         far_end.close()  # so that the worker alone holds it, and its end is heard
         self._seen = psutil.Process(self.process.pid)
 
@@ -243,9 +246,26 @@ def _context(function: Callable[..., Any]) -> BaseContext:
     return context
 
 
+@contextmanager
+def _out_of_reach_of_ctrl_c() -> Iterator[None]:
+    """What is started here never hears it: on a terminal it reaches everyone, and the coordinator decides for all.
+
+    To ignore it is too late for a process that is still importing, and would say so in many lines.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # it would lift the block if it were started behind it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _work(line: Connection, terms: Terms[Any, Any]) -> None:
     """The life of a worker."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches everyone; what it means the coordinator decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where it could not be kept away
     threading.Thread(target=_follow_coordinator, daemon=True).start()
     _limit_threads(terms.threads)
     if terms.initializer is not None:
