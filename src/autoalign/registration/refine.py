@@ -28,11 +28,12 @@ from autoalign.geometry.homography import (
 )
 from autoalign.geometry.least_squares import Correspondences, polish
 from autoalign.geometry.ransac import Consensus
-from autoalign.picture.pixels import Picture, Shrunken, halve, shrink, size_of, to_8_bit
+from autoalign.picture.pixels import Picture, Shrunken, halve, size_of, to_8_bit
 from autoalign.registration.patches import RIM, Comparison, compare
 
 _COMMON_BIAS = 0.25  # sigmas that all keypoints may be off together: ORB's corners are whole pixels
 _SCOUTS = 400  # patches that lead the way, at least
+_CORNER_PIXELS = 1e6  # corners are looked for in a picture that is halved to at most so many
 _HELD_OUT = 5  # every fifth patch judges
 
 
@@ -65,8 +66,8 @@ class Patches:
     """What was measured on the pixels, under the transform that came out."""
 
     pairs: Correspondences  # src moving px, dst fixed px, n
-    before: Array  # (n,) normalised correlation under the consensus
-    after: Array  # (n,) the same under the result
+    before: Array  # (n,) normalised correlations under the consensus
+    after: Array  # (n,) the same under the result; of those that were fitted, just before their last fit
     kept: Mask  # (n,) took part in the fit
 
 
@@ -209,12 +210,13 @@ def _corners(
     masks: tuple[Mask | None, Mask | None],
 ) -> Array:
     """(n, 2) corners of the fixed picture, spread, whose patches lie in both pictures."""
-    small = shrink(to_8_bit(fixed), 1e6)
+    halvings = max(0, int(np.ceil(np.log2(fixed.size / _CORNER_PIXELS) / 2)))
+    small = pyramid(fixed, halvings, 0)[0]
     w, h = size_of(small.pixels)
     apart = max(4.0, np.sqrt(w * h / options.patches) * 0.6)
     usable, moving_usable = masks
     mask = None if usable is None else cv2.resize(usable.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
-    found = cv2.goodFeaturesToTrack(small.pixels, 3 * options.patches, 0.003, apart, mask=mask, blockSize=7)
+    found = cv2.goodFeaturesToTrack(to_8_bit(small.pixels), 3 * options.patches, 0.003, apart, mask=mask, blockSize=7)
     if found is None:
         return np.zeros((0, 2))
     points = apply(small.full_from_small, found.reshape(-1, 2))
