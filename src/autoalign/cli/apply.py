@@ -10,18 +10,25 @@ import numpy as np
 from cyclopts import Parameter
 
 from autoalign.cli.files import SCREEN_PIXEL, check_mask_format, check_outputs
-from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, complain, note
+from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, complain, note, progress
 from autoalign.errors import ImageReadError, ImageWriteError
+from autoalign.files.large import (
+    AnyPicture,
+    LargeDrawing,
+    check_large_drawing,
+    opened_picture,
+    write_large_result,
+)
 from autoalign.files.metadata import on_grid_of
 from autoalign.files.points import POSITIONS, read_points, write_points
 from autoalign.files.read import LoadedPicture, ReadOptions
-from autoalign.files.result import write_mask
+from autoalign.files.result import ResultFiles, write_mask
 from autoalign.files.sidecar import Sidecar, read_sidecar, transform_of
-from autoalign.files.sized import read_sized
+from autoalign.files.sized import check_sized
 from autoalign.files.write import check_format, default_output, write_picture
 from autoalign.geometry.homography import invert, project
 from autoalign.picture.border import Border, like_bordered
-from autoalign.picture.canvas import CanvasKind
+from autoalign.picture.canvas import CanvasKind, canvas
 from autoalign.picture.warp import Interpolation
 from autoalign.registration.drawing import Drawing, draw
 
@@ -89,8 +96,9 @@ def apply(
     worst = Exit.DONE
     for image, output in zip(images, outputs, strict=True):
         try:
-            loaded = read_sized(image, record.moving.size, reading, page=options.page)
-            _put(record, loaded, output, drawing, options, common)
+            with opened_picture(image, reading, page=options.page) as picture:
+                check_sized(picture.pixels, record.moving.size, image)
+                _put(record, picture, output, drawing, options, common)
         except (ImageReadError, ImageWriteError) as error:  # the others are still wanted
             complain(str(error))
             worst = Exit.FILE
@@ -114,18 +122,32 @@ def _output(image: Path, options: ApplyOptions, drawing: Drawing) -> Path:
 
 
 def _put(
-    record: Sidecar, loaded: LoadedPicture, output: Path, drawing: Drawing, options: ApplyOptions, common: Common
+    record: Sidecar, picture: AnyPicture, output: Path, drawing: Drawing, options: ApplyOptions, common: Common
 ) -> None:
     """One picture through the transform."""
-    if loaded.remark:
-        note(f"{loaded.remark}: {loaded.path}", common)
-    check_format(output, like_bordered(loaded.pixels, drawing.border))
+    if picture.remark:
+        note(f"{picture.remark}: {picture.path}", common)
+    check_format(output, like_bordered(picture.pixels, drawing.border))
     transform = transform_of(record)
-    drawn = draw(loaded.pixels, record.fixed.size, transform, drawing, interpolation=options.interpolation)
-    metadata = on_grid_of(None, loaded.metadata, drawn.frame, transform, record.moving.size)
-    write_picture(output, drawn.warped.pixels, metadata, overwrite=common.overwrite)
-    if options.save_mask:
-        write_mask(options.save_mask, drawn.warped, common.overwrite)
+    if isinstance(picture, LoadedPicture):
+        drawn = draw(picture.pixels, record.fixed.size, transform, drawing, interpolation=options.interpolation)
+        metadata = on_grid_of(None, picture.metadata, drawn.frame, transform, record.moving.size)
+        write_picture(output, drawn.warped.pixels, metadata, overwrite=common.overwrite)
+        if options.save_mask:
+            write_mask(options.save_mask, drawn.warped, common.overwrite)
+    else:
+        check_large_drawing(drawing, output, options.save_mask)
+        frame = canvas(drawing.canvas, record.fixed.size, record.moving.size, transform)
+        what = LargeDrawing(
+            pixels=picture.pixels,
+            frame=frame,
+            fixed_from_moving=transform,
+            drawing=drawing,
+            interpolation=options.interpolation,
+        )
+        metadata = on_grid_of(None, picture.metadata, frame, transform, record.moving.size)
+        files = ResultFiles(aligned=output, mask=options.save_mask)
+        write_large_result(files, what, metadata, None, progress("drawing", common), common.overwrite)
     note(f"wrote {', '.join(str(path) for path in (output, options.save_mask) if path)}", common)
 
 

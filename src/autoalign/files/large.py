@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from autoalign.errors import ImageReadError, ImageWriteError
+from autoalign.errors import ImageWriteError
 from autoalign.files.formats import HEAD_BYTES, TIFF, of_name
 from autoalign.files.metadata import Metadata
 from autoalign.files.read import LoadedPicture, ReadOptions, opened, read_picture
 from autoalign.files.result import ResultFiles, seen_in, write_overlay
+from autoalign.files.sized import check_sized
 from autoalign.geometry.homography import Array, Mask, invert
 from autoalign.picture.border import like_bordered
 from autoalign.picture.canvas import Canvas
@@ -76,18 +77,11 @@ def read_mask_of_copy(path: Path, picture: Large) -> Mask:
     Raises ImageReadError, the path last.
     """
     with opened_picture(path) as mask:
-        check_is_of_size(mask, size_of(picture.pixels))
+        check_sized(mask.pixels, size_of(picture.pixels), path)
         hidden = grey(working_copy(mask.pixels, WORKING_PIXELS).pixels) != 0
     # The copy may be of an overview, which is smaller by another number.
     rows, columns = (np.arange(n) * m // n for n, m in zip(picture.copy.pixels.shape, hidden.shape, strict=False))
     return np.asarray(~hidden[np.ix_(rows, columns)])
-
-
-def check_is_of_size(picture: AnyPicture, size: tuple[int, int]) -> None:
-    """Raise ImageReadError, the path last, unless a picture has this size (w, h)."""
-    (w, h), (wanted_w, wanted_h) = size_of(picture.pixels), size
-    if (w, h) != size:
-        raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {picture.path}")
 
 
 def check_large_drawing(drawing: Drawing, *outputs: Path | None) -> None:
@@ -137,20 +131,20 @@ def write_large_result(
     files: ResultFiles,
     what: LargeDrawing,
     metadata: Metadata,
-    copies: tuple[Large, Large],
+    copies: tuple[Large, Large] | None,
     watch: Watch,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Draw the pictures that are wanted, write them, and say which they are; the overlay is of the copies.
+    """Draw the pictures that are wanted, write them, and say which they are; an overlay is of the copies.
 
-    Raises CanvasError where no canvas can hold them, ImageWriteError as `write_in_strips` does.
+    `copies` are those of (fixed, moving). Raises CanvasError where no canvas can hold them, ImageWriteError as `write_in_strips` does.
     """
     written = [path for path in (files.aligned, files.mask, files.overlay) if path is not None]
     if files.aligned is not None:
         write_large(files.aligned, what, metadata, watch, overwrite)
     if files.mask is not None:
         write_large_mask(files.mask, what, watch, overwrite)
-    if files.overlay is not None:
+    if files.overlay is not None and copies is not None:
         still, moved = (of.copy for of in copies)
         transform = invert(still.full_from_small) @ what.fixed_from_moving @ moved.full_from_small
         drawn = draw(moved.pixels, size_of(still.pixels), transform, what.drawing)

@@ -8,7 +8,7 @@ from pathlib import Path
 from autoalign.errors import ImageReadError
 from autoalign.files.read import LoadedPicture, ReadOptions, read_picture
 from autoalign.geometry.homography import Mask
-from autoalign.picture.pixels import grey, size_of
+from autoalign.picture.pixels import PixelSource, grey, size_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,10 +24,15 @@ def read_sized(
 ) -> LoadedPicture:
     """Read a picture that must be of `size` (w, h). Raises ImageReadError, the path last."""
     loaded = read_picture(path, options, page=page)
-    if size_of(loaded.pixels) != size:
-        (w, h), (wanted_w, wanted_h) = size_of(loaded.pixels), size
-        raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {path}")
+    check_sized(loaded.pixels, size, path)
     return loaded
+
+
+def check_sized(pixels: PixelSource, size: tuple[int, int], path: Path) -> None:
+    """Raise ImageReadError, the path last, unless the pixels of a file are of `size` (w, h)."""
+    (w, h), (wanted_w, wanted_h) = size_of(pixels), size
+    if (w, h) != size:
+        raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {path}")
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> LoadedMask:
