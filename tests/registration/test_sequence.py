@@ -18,7 +18,8 @@ from autoalign.geometry.homography import apply, invert, normalisation, shown, t
 from autoalign.geometry.least_squares import step
 from autoalign.geometry.uncertainty import overlap_points
 from autoalign.registration.align import align
-from autoalign.registration.sequence import Link, link_of, links, solve_sequence
+from autoalign.registration.alignment import AlignOptions
+from autoalign.registration.sequence import Link, SequenceOptions, link_of, links, solve_sequence
 
 SIZE = (640, 400)
 GRID = overlap_points(np.eye(3), SIZE, SIZE, 8)
@@ -182,6 +183,31 @@ def test_links_that_leave_a_frame_open_make_it_doubtful():
     assert "open to" in frames[2].reason
 
 
+def test_a_threshold_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="out of range"):
+        SequenceOptions(link_threshold=0.0)
+
+
+def test_a_link_that_is_worse_than_the_others_but_as_good_as_it_claims_counts_less():
+    """All links but one agree far better than they claim: it is not overruled, but hardly moves anything."""
+    n, truth = 9, truth_of(9)
+    found = [replace(made(truth, f, m), covariance=rows(1e-6 * np.eye(8))) for f, m in links(n, 0)]
+    off = replace(made(truth, 0, 7, off_px=1.2), covariance=rows(1e-6 * np.eye(8)))
+    frames = solved(n, [*without(found, {(0, 7)}), off])
+    assert {frame.status for frame in frames} == {"aligned"}
+    assert not any(frame.overruled for frame in frames)
+    assert max(off_px(frame, t) for frame, t in zip(frames, truth, strict=True)) < 0.05
+
+
+def test_two_links_that_differ_by_less_than_they_claim_hold_a_frame():
+    n, truth = 9, truth_of(9)
+    found = [replace(made(truth, f, m), covariance=rows(1e-6 * np.eye(8))) for f, m in links(n - 1, 0)]
+    off = [replace(made(truth, f, 8, off_px=px), covariance=rows(1e-6 * np.eye(8))) for f, px in ((7, 0.0), (0, 1.2))]
+    frames = solved(n, [*found, *off])
+    assert frames[8].status == "aligned"
+    assert len(frames[8].used) == 2
+
+
 def test_what_travels_of_a_pair_is_small_and_true():
     of = pair("rocket.jpg", turn(170.0, 120.0, 3.0, 1.02) @ translation(9.0, -4.0), (340, 240))
     alignment = align(of.fixed, of.moving)
@@ -201,10 +227,11 @@ def test_a_rejected_pair_gives_a_rejected_link():
 
 
 def test_a_time_lapse_does_not_drift():
-    """Twelve frames that drift by half of their width: far under a tenth of a pixel, and under plain chaining."""
+    """Twelve noisy frames that drift by half of their width: under a tenth of a pixel, where plain chaining is not."""
     n = 12
-    lapse = time_lapse("hubble_deep_field.jpg", n, (360, 300))
-    alignments = {(f, m): align(lapse.frames[f], lapse.frames[m]) for f, m in links(n, 0)}
+    lapse = time_lapse("hubble_deep_field.jpg", n, (340, 280), noise=12.0)
+    fast = AlignOptions(effort="fast")
+    alignments = {(f, m): align(lapse.frames[f], lapse.frames[m], fast) for f, m in links(n, 0)}
     frames = solve_sequence(n, 0, [link_of(a, *pair) for pair, a in alignments.items()], [lapse.size] * n)
     chained = [np.eye(3)]
     for i in range(1, n):
@@ -214,6 +241,6 @@ def test_a_time_lapse_does_not_drift():
     one_by_one = np.array([lapse.error_px(transform, i) for i, transform in enumerate(chained)])
     expected = np.array([frame.expected_error_px for frame in frames])
     print(f"last frame: {together[-1]:.4f} px together, {one_by_one[-1]:.4f} px chained, {expected[-1]:.4f} expected")
-    assert together[-1] < 0.05
-    assert together.mean() < one_by_one.mean()
-    assert (together[1:] < expected[1:]).all()
+    assert together[-1] < 0.07
+    assert together.mean() < 0.8 * one_by_one.mean()
+    assert together.mean() < expected.mean()

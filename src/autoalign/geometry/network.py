@@ -31,6 +31,7 @@ _DIRECTIONS = MODELS["homography"].generators  # (8, 3, 3), orthogonal to each o
 _ALONG = _DIRECTIONS / np.square(_DIRECTIONS).sum((1, 2), keepdims=True)
 _MEDIAN_SQUARE = 7.344  # median of a chi-square of eight degrees of freedom
 _SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+_BEST = 0.2  # the least share of what ties claim that is believed to be their error, however well they agree
 _NARROWING = 4.0  # of the loss, per step
 _WIDEST = 4.0**20  # squared misfit; a tie that is further off takes no part from the beginning
 _SAMPLES = 128  # of the error of all frames together: their covariance is known to 12 %, its root to 6 %
@@ -73,7 +74,7 @@ def adjust(
     """All `reference_from_frame` of the model together; the reference keeps the identity.
 
     `norm` (n, 3, 3) brings the points of each frame to mean 0 and size 1. A tie is overruled where its misfit is over
-    `threshold` standard deviations, as large as the ties themselves show these to be.
+    `threshold` standard deviations, as it claims them, or as the ties show them where these are larger.
     """
     if not len(ties):
         return _untied(model, norm)
@@ -99,16 +100,18 @@ def adjust_in_simplest(
 ) -> tuple[Model, Adjustment]:
     """The simplest of the models, given from simple to general, in which the ties agree as in the most general one.
 
-    That is the one of least BIC (Schwarz 1978) among those that overrule no tie that it does not. The scale is that of
-    the errors that the ties claim, or show where these are larger: nothing finer is read out of them.
+    That is the one of least BIC (Schwarz 1978) among those that leave no tie of these off by `threshold` standard
+    deviations. The scale is that of the errors that the ties claim, or show where these are larger: nothing finer is
+    read out of them.
     """
     general = adjust(models[-1], reference, norm, ties, threshold=threshold)
     best, chosen = np.inf, (models[-1], general)
     for model in models:
         adjusted = general if model is models[-1] else adjust(model, reference, norm, ties, threshold=threshold)
-        if (adjusted.kept | ~general.kept).all():
-            squared = 8.0 * (adjusted.misfit[general.kept] / max(general.unit_sigma, 1.0)) ** 2
-            criterion = squared.sum() + model.degrees_of_freedom * len(norm) * np.log(max(8 * len(squared), 1))
+        misfit = adjusted.misfit[general.kept] / max(general.unit_sigma, 1.0)
+        if (misfit <= threshold).all():
+            parameters = model.degrees_of_freedom * len(norm)
+            criterion = 8.0 * float(np.square(misfit).sum()) + parameters * np.log(max(8 * len(misfit), 1))
             if criterion < best:
                 best, chosen = criterion, (model, adjusted)
     return chosen
@@ -219,21 +222,27 @@ def _graduated(network: _Network, transforms: Array, threshold: float, max_steps
 
 
 def _settled(network: _Network, transforms: Array, threshold: float, max_steps: int) -> Adjustment:
-    """Least squares on the ties that are not overruled, until these stop changing."""
+    """Least squares on the ties that are not overruled, until nothing changes.
+
+    Where ties agree better than they claim, those that do not count less, by the scale that the others show; but they
+    contradict nothing, and may be all that holds a frame.
+    """
     kept = np.ones(len(network.ties), np.bool_)
     for _ in range(max_steps):
         at = _linearise(network, transforms)
         unit_variance = _unit_variance(network, at.squared[kept], len(network.held(kept)))
-        before, kept = kept, at.squared <= _limit(threshold, unit_variance)
+        before, kept = kept, at.squared <= _limit(threshold, max(unit_variance, 1.0))
         held = network.held(kept)
-        transforms, moved = _moved(network, transforms, at, kept.astype(np.float64), held)
+        shown = _limit(threshold, max(unit_variance, _BEST**2))
+        weights = kept * np.minimum(shown / np.maximum(at.squared, 1e-300), 1.0) ** 2
+        transforms, moved = _moved(network, transforms, at, weights, held)
         if moved < 1e-9 and (kept == before).all():
             break
     loose = np.setdiff1d(np.arange(len(transforms)), [network.reference, *held])
     transforms[loose] = unit(IDENTITY)
     return Adjustment(
         reference_from_frame=transforms,
-        covariance=max(unit_variance, 1.0) * _covariance(network, at, kept, held),
+        covariance=max(unit_variance, 1.0) * _covariance(network, at, weights, held),
         norm=network.norm,
         kept=kept,
         misfit=np.sqrt(at.squared / 8.0),
@@ -250,8 +259,8 @@ def _unit_variance(network: _Network, squared: Array, held: int) -> float:
 
 
 def _limit(threshold: float, unit_variance: float) -> float:
-    """The squared misfit from which a tie is overruled; ties that agree better than they claim are not held to it."""
-    return 8.0 * threshold**2 * max(unit_variance, 1.0)
+    """The squared misfit from which a tie is overruled."""
+    return 8.0 * threshold**2 * unit_variance
 
 
 def _moved(network: _Network, transforms: Array, at: _Linearised, weights: Array, held: Indices) -> tuple[Array, float]:
@@ -294,7 +303,7 @@ def _factored(slope: scipy.sparse.csr_array) -> scipy.sparse.linalg.SuperLU:
     )
 
 
-def _covariance(network: _Network, at: _Linearised, kept: Mask, held: Indices) -> Array:
+def _covariance(network: _Network, at: _Linearised, weights: Array, held: Indices) -> Array:
     """(n, dof, dof) covariances of the frames, from samples of the ties' errors taken through the solution.
 
     The exact blocks of the inverse would cost a solution for every frame.
@@ -302,7 +311,7 @@ def _covariance(network: _Network, at: _Linearised, kept: Mask, held: Indices) -
     dof = network.model.degrees_of_freedom
     covariance = np.zeros((len(network.norm), dof, dof))
     if len(held):
-        slope = _stacked(network, at, kept.astype(np.float64), held)
+        slope = _stacked(network, at, weights, held)
         noise = np.random.default_rng(0).normal(size=(slope.shape[0], _SAMPLES))
         errors = _factored(slope).solve(slope.T @ noise).reshape(len(held), dof, _SAMPLES)
         covariance[held] = np.einsum("fgs,fhs->fgh", errors, errors) / _SAMPLES

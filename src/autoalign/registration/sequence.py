@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,12 +43,11 @@ class Link:
 class SequenceOptions:
     """How links become transforms."""
 
-    threshold: float = 3.0
-    """a link is overruled if it is off by so many standard deviations, as the links themselves show these to be"""
-    verdict: VerdictOptions = field(default_factory=VerdictOptions)
+    link_threshold: float = 3.0
+    """standard deviations, as links claim or as they show where these are larger, off by which a link is overruled"""
 
     def __post_init__(self) -> None:
-        if self.threshold <= 0:
+        if self.link_threshold <= 0:
             raise ValueError(f"SequenceOptions out of range: {self}")
 
 
@@ -118,14 +117,16 @@ def solve_sequence(
     links: Sequence[Link],
     sizes: Sequence[tuple[int, int]],
     options: SequenceOptions | None = None,
+    verdict: VerdictOptions | None = None,
 ) -> tuple[SequenceFrame, ...]:
     """Every frame's transform onto the reference, from the links between them, whose order does not matter.
 
     `sizes` are (w, h) of the n frames. The frames move in the simplest model that all links agree on. Aligned are
     frames that aligned links hold to the reference; those that hang on a doubtful link are doubtful, and so are those
-    that hang on one link alone where another contradicts it. Raises ValueError for frames that are not there.
+    that hang on one link alone where another contradicts it, and those whose expected error is over what `verdict`
+    allows a pair. Raises ValueError for frames that are not there.
     """
-    options = options or SequenceOptions()
+    options, verdict = options or SequenceOptions(), verdict or VerdictOptions()
     _check(n, reference)
     if len(sizes) != n:
         raise ValueError(f"{len(sizes)} sizes for {n} frames")
@@ -133,12 +134,12 @@ def solve_sequence(
         raise ValueError(f"a link names a frame that is not among the {n}")
     chosen = _needed(n, sorted(links, key=lambda link: (link.fixed, link.moving)))
     model, adjusted = adjust_in_simplest(
-        _models(chosen), reference, _norms(sizes), _ties(chosen), threshold=options.threshold
+        _models(chosen), reference, _norms(sizes), _ties(chosen), threshold=options.link_threshold
     )
     standing = _standing(n, reference, chosen, adjusted)
     tried = Counter(frame for link in links for frame in (link.fixed, link.moving))
     return tuple(
-        _frame(frame, tried[frame], model, adjusted, standing, (sizes[frame], sizes[reference]), options.verdict)
+        _frame(frame, tried[frame], model, adjusted, standing, (sizes[frame], sizes[reference]), verdict)
         for frame in range(n)
     )
 
@@ -195,7 +196,7 @@ class _Standing:
 
 def _standing(n: int, reference: int, links: Sequence[Link], adjusted: Adjustment) -> _Standing:
     kept = [link for link, agrees in zip(links, adjusted.kept, strict=True) if agrees]
-    against = [link for link, agrees in zip(links, adjusted.kept, strict=True) if not agrees]
+    overruled = [link for link, agrees in zip(links, adjusted.kept, strict=True) if not agrees]
     unsure = np.array([link.status == "doubtful" for link in kept], np.bool_)
     # A way without a doubtful link is better than any way with one.
     tree = cheapest_tree(n, reference, *_ends(kept), np.where(unsure, 2.0 * n, 1.0))
@@ -205,9 +206,9 @@ def _standing(n: int, reference: int, links: Sequence[Link], adjusted: Adjustmen
     return _Standing(
         held=tree.reached,
         doubtful=doubtful,
-        disputed=hanging_in_dispute(tree, *_ends(kept), *_ends(against)),
+        disputed=hanging_in_dispute(tree, *_ends(kept), *_ends(overruled)),
         used=_of_frames(n, kept),
-        overruled=_of_frames(n, against),
+        overruled=_of_frames(n, overruled),
     )
 
 
