@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from autoalign.geometry.homography import Array, Mask, jacobian, project, translation
 from autoalign.geometry.uncertainty import overlap_points
-from autoalign.picture.pixels import shrink_by, size_of
+from autoalign.picture.pixels import halve, shrink_by, size_of
 from autoalign.picture.warp import warp
 
 _OVERLAY_PIXELS = 0.1e6  # the overlap is looked at in so many pixels: coarse, so that a pixel or two do not matter
@@ -92,8 +92,13 @@ def _overlay(
 
 def _smaller(image: NDArray[np.uint8], factor: float) -> tuple[_Float, Array]:
     """The picture smaller and smoothed, and the (3, 3) map back to its own pixels."""
+    # Whole grey levels do as long as the mean of several pixels is still to be taken of them; halving is fast.
+    picture_from_half = np.eye(3)
+    while factor >= 4.0:
+        half = halve(image)
+        image, picture_from_half, factor = half.pixels, picture_from_half @ half.full_from_small, factor / 2
     small = shrink_by(image.astype(np.float32), factor)
-    return np.asarray(cv2.GaussianBlur(small.pixels, (0, 0), 0.7)), small.full_from_small
+    return np.asarray(cv2.GaussianBlur(small.pixels, (0, 0), 0.7)), picture_from_half @ small.full_from_small
 
 
 def _edges(image: _Float) -> _Float:
@@ -108,6 +113,11 @@ def _blocks(image: NDArray[np.generic]) -> NDArray[np.generic]:
     return np.asarray(cut.transpose(0, 2, 1, 3).reshape(rows * columns, _BLOCK * _BLOCK))
 
 
+def _means(a: _Float, b: _Float) -> _Float:
+    """(n,) mean products of blocks (n, pixels); without BLAS, whose bits depend on the number of threads."""
+    return np.asarray(np.einsum("ij,ij->i", a, b) / np.float32(a.shape[1]))
+
+
 def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
     whole = np.flatnonzero(np.asarray(_blocks(valid)).all(1))
     a, b = (np.asarray(_blocks(p), np.float32)[whole] for p in (fixed, moving))
@@ -119,9 +129,10 @@ def _compare(fixed: _Float, moving: _Float, valid: Mask) -> Agreement:
     # A contrast of one grey level stands for the noise, so that a flat block does not agree with a rich one.
     a = (a - a.mean(1, keepdims=True)) / np.hypot(a_contrast, 1.0)[:, None]
     b = (b - b.mean(1, keepdims=True)) / np.hypot(b_contrast, 1.0)[:, None]
-    correlation = (a * b).mean(1)
+    correlation = _means(a, b)
     shifts = np.unique(np.linspace(1, len(a) - 1, _SHIFTS).astype(int))
-    by_chance = np.concatenate([(a * np.roll(b, int(s), axis=0)).mean(1) for s in shifts])
+    twice = np.concatenate([b, b])
+    by_chance = np.concatenate([_means(a, twice[s : s + len(b)]) for s in shifts])
     agreeing = correlation > np.quantile(by_chance, 1.0 - _CHANCE)
     share, core = _shares(agreeing, np.stack(np.divmod(whole[told], fixed.shape[1] // _BLOCK), 1))
     return Agreement(
