@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -79,6 +80,12 @@ class Job:
 
     def _beside(self, ending: str) -> Path:
         return Path(self.out_dir, *PurePosixPath(self.name + ending).parts)
+
+
+def rooted(job: Job) -> Job:
+    """The job with absolute paths, for workers that are not in the working folder of this process."""
+    paths = {name: getattr(job, name) for name in ("fixed", "moving", "out_dir", "fixed_mask", "moving_mask")}
+    return replace(job, **{name: os.path.abspath(path) for name, path in paths.items() if path})
 
 
 def key(job: Job, hash_of: Callable[[str], str]) -> str:

@@ -48,7 +48,7 @@ def feature_store(out_dir: Path, cache: Path | None) -> Iterator[Path]:
 
     If the block is left early it stays, and the next run finds it.
     """
-    store = cache or out_dir / STORE_NAME
+    store = (cache or out_dir / STORE_NAME).absolute()  # workers may be in another folder
     store.mkdir(parents=True, exist_ok=True)
     yield store
     if not cache:

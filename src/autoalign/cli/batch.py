@@ -14,7 +14,7 @@ from cyclopts import Parameter
 
 from autoalign.batch.chain import link_up, place
 from autoalign.batch.engine import Engine
-from autoalign.batch.jobs import Job, JobOptions, Recorded
+from autoalign.batch.jobs import Job, JobOptions, Recorded, rooted
 from autoalign.batch.ledger import FILE_NAME as LEDGER
 from autoalign.batch.ledger import Ledger, LedgerReader
 from autoalign.batch.manifest import manifest_jobs
@@ -86,6 +86,8 @@ def batch(
     started = time.monotonic()
     wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
     jobs, reference = _jobs(source, files, selection, wanted)
+    if running.scheduler:
+        jobs = [rooted(job) for job in jobs]
     if again.plan:
         return _tell_plan(jobs, reference, files.out_dir)
     make_folder(files.out_dir)

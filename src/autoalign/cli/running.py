@@ -10,7 +10,7 @@ from cyclopts import Group
 
 from autoalign.batch.engine import Engine, LocalEngine
 from autoalign.batch.slot import Limits
-from autoalign.errors import ImageWriteError
+from autoalign.errors import EngineError, ImageWriteError
 
 RUNNING = Group("Running", sort_key=1.5)
 GB = 1e9
@@ -22,6 +22,8 @@ class Running:
 
     workers: int | None = None
     """pairs at a time; by default as many as there are cores"""
+    scheduler: str | None = None
+    """address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers do the work: docs/cluster.md"""
     kill_after: float = 600.0
     """seconds after which a pair is given up"""
     max_memory: float = 8.0
@@ -31,8 +33,16 @@ class Running:
 
 
 def engine_of(running: Running) -> Engine:
-    """Where the work is done. Raises ValueError for options out of range."""
+    """Where the work is done. Raises ValueError for options out of range, EngineError without the package for it."""
     limits = Limits(time_s=running.kill_after, memory=round(running.max_memory * GB))
+    if running.scheduler:
+        if running.workers is not None:
+            raise ValueError("--workers is for this machine; on a cluster there are as many as Dask has threads")
+        try:
+            from autoalign.batch.cluster import DaskEngine  # not above: distributed takes seconds, and is an extra
+        except ImportError as error:
+            raise EngineError(f"--scheduler needs: pip install 'autoalign[cluster]' ({error})") from None
+        return DaskEngine(scheduler=running.scheduler, limits=limits)
     return LocalEngine(workers=running.workers, limits=limits)
 
 

@@ -15,7 +15,7 @@ from cyclopts import Parameter
 
 from autoalign.batch.arrivals import Arrivals, hints
 from autoalign.batch.engine import Engine
-from autoalign.batch.jobs import Job, JobOptions, Recorded
+from autoalign.batch.jobs import Job, JobOptions, Recorded, rooted
 from autoalign.batch.ledger import Ledger
 from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
 from autoalign.batch.sources import Selection, onto_reference
@@ -82,6 +82,8 @@ def watch(
         note(f"watching {folder}; Ctrl-C ends it", common)
         for names in _arriving(folder, selection, files):
             jobs = onto_reference(folder, names, files.reference, files.out_dir, wanted)
+            if running.scheduler:
+                jobs = [rooted(job) for job in jobs]
             counts.update(_align(jobs, files, ledger, engine, store, common))
             write_reports(files.out_dir, ledger, about)
     tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing new arrived")
