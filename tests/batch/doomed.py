@@ -68,6 +68,13 @@ def greet() -> None:
     os.environ["AUTOALIGN_TEST_GREETING"] = "good morning"
 
 
+class Unreadable:
+    """A job that can be sent, and not be read."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return int, ("no number",)
+
+
 def refuse() -> None:
     os._exit(5)
 

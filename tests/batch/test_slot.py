@@ -46,6 +46,15 @@ def test_a_worker_with_nothing_to_do_goes_and_another_comes() -> None:
         assert there.run(0.0).casualty is None
 
 
+def test_a_job_that_cannot_be_read_is_an_error() -> None:
+    with slot(doomed.identity) as there:
+        outcome = there.run(doomed.Unreadable())
+        assert there.run("next one").result == "next one"
+    assert outcome.casualty is not None
+    assert outcome.casualty.cause == "error"
+    assert outcome.casualty.reason.startswith("ValueError: invalid literal")
+
+
 def test_a_stopped_slot_stays_stopped() -> None:
     with slot(doomed.doze) as there:
         worker = there.run(0.0).result

@@ -91,16 +91,18 @@ class InlineEngine:
 
 def stream(submit: Callable[[J], Future[R]], jobs: Iterable[J], ahead: int) -> Iterator[tuple[J, Future[R]]]:
     """Submit the jobs, never more than `ahead` at a time, and yield each with its future once that is done."""
-    done: SimpleQueue[tuple[J, Future[R]]] = SimpleQueue()
-    under_way = 0
+    done: SimpleQueue[Future[R]] = SimpleQueue()
+    under_way: dict[Future[R], J] = {}
     for job in jobs:
-        submit(job).add_done_callback(lambda future, job=job: done.put((job, future)))
-        under_way += 1
-        while under_way >= ahead or not done.empty():
-            yield done.get()
-            under_way -= 1
-    for _ in range(under_way):
-        yield done.get()
+        future = submit(job)
+        under_way[future] = job
+        future.add_done_callback(done.put)
+        while len(under_way) >= ahead or not done.empty():
+            future = done.get()
+            yield under_way.pop(future), future
+    while under_way:
+        future = done.get()
+        yield under_way.pop(future), future
 
 
 def cores() -> int:

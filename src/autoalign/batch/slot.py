@@ -274,9 +274,12 @@ def _work(line: Connection, terms: Terms[Any, Any]) -> None:
     while line.poll(terms.idle_s):
         try:
             job = line.recv()
-        except EOFError:
+        except (EOFError, OSError):
             return
-        _answer(line, *attempt(terms.function, job))
+        except Exception as error:  # the job is none that can be had here
+            _answer(line, None, _error(error))
+        else:
+            _answer(line, *attempt(terms.function, job))
 
 
 def attempt(function: Callable[[J], R], job: J) -> tuple[R | None, Casualty | None]:
