@@ -134,6 +134,7 @@ HOMES: dict[str, tuple[str, ...]] = {
         "registration.patches",
         "registration.refine",
         "registration.agreement",
+        "registration.large",
         "files.feature_store",  # its version only
         "files.record",  # its version only
         "batch.slot",  # its threads only

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from autoalign.geometry.homography import apply, invert
+from autoalign.picture import pixels as pixels_module
 from autoalign.picture.pixels import (
     check_picture,
     grey,
@@ -16,6 +17,7 @@ from autoalign.picture.pixels import (
     shrink,
     size_of,
     to_8_bit,
+    working_copy,
 )
 
 
@@ -128,3 +130,37 @@ def test_in_colour_keeps_alpha_and_its_grey(channels):
     assert coloured.shape == (5, 7, 4 if channels in (2, 4) else 3)
     np.testing.assert_array_equal(coloured[..., :3], image[..., :3] if channels > 2 else image[..., :1].repeat(3, 2))
     np.testing.assert_array_equal(coloured[..., 3:], image[..., 1:2] if channels == 2 else image[..., 3:])
+
+
+@pytest.mark.parametrize("strip_pixels", [1, 40_000, 1 << 24])
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_a_working_copy_is_the_mean_of_whole_squares(monkeypatch, strip_pixels, channels):
+    monkeypatch.setattr(pixels_module, "STRIP_PIXELS", strip_pixels)
+    image = np.random.default_rng(4).random((211, 317, *channels), np.float32)
+    copy = working_copy(image, 211 * 317 / 20)  # sides 5 times smaller: 42 and 63, and a rest
+    expected = image[:210, :315].reshape(42, 5, 63, 5, *channels).mean((1, 3))
+    assert np.allclose(copy.pixels, expected, atol=1e-6)
+    assert np.allclose(apply(copy.full_from_small, [[0.0, 0.0], [62.0, 41.0]]), [[2.0, 2.0], [312.0, 207.0]])
+
+
+def test_a_working_copy_of_a_small_picture_is_the_picture():
+    image = np.random.default_rng(4).integers(0, 256, (21, 31, 3), np.uint8)
+    copy = working_copy(image, 1e6)
+    assert np.array_equal(copy.pixels, image)
+    assert np.array_equal(copy.full_from_small, np.eye(3))
+    assert working_copy(np.zeros((2, 1000), np.uint8), 10).pixels.shape == (1, 500)
+
+
+def test_a_source_is_asked_for_every_pixel_once():
+    image = np.random.default_rng(4).integers(0, 256, (300, 401), np.uint8)
+    asked = np.zeros(image.shape, int)
+
+    class Source:
+        shape, dtype = image.shape, image.dtype
+
+        def __getitem__(self, box):
+            asked[box] += 1
+            return image[box]
+
+    working_copy(Source(), 5_000)
+    assert (asked[:300, :400] == 1).all()

@@ -175,6 +175,29 @@ def test_tile_of_one_pixel():
     )
 
 
+class Boxes:
+    """A picture that gives its pixels only box by box, and remembers how large these were."""
+
+    def __init__(self, pixels):
+        self._pixels, self.shape, self.dtype, self.sizes = pixels, pixels.shape, pixels.dtype, []
+
+    def __getitem__(self, box):
+        part = self._pixels[box].copy()
+        self.sizes.append(part.shape[0] * part.shape[1])
+        return part
+
+
+@pytest.mark.parametrize("channels", CHANNELS)
+def test_a_source_is_asked_for_boxes_and_gives_the_same(channels):
+    image = picture(np.uint16, channels, (230, 170))
+    source = Boxes(image)
+    drawn, expected = (warp(of, (211, 190), PERSPECTIVE, tile_px=32) for of in (source, image))
+    assert np.array_equal(drawn.pixels, expected.pixels)
+    assert np.array_equal(drawn.valid, expected.valid)
+    assert len(source.sizes) > 10
+    assert max(source.sizes) < image.shape[0] * image.shape[1] / 4
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_same_bits_on_any_number_of_threads(dtype):
     image = picture(dtype, 3, (640, 480))

@@ -137,7 +137,8 @@ def write_large_result(
 ) -> list[Path]:
     """Draw the pictures that are wanted, write them, and say which they are; an overlay is of the copies.
 
-    `copies` are those of (fixed, moving). Raises CanvasError where no canvas can hold them, ImageWriteError as `write_in_strips` does.
+    `copies` are those of (fixed, moving). Raises CanvasError where no canvas can hold them, ImageWriteError as
+    `write_in_strips` does.
     """
     written = [path for path in (files.aligned, files.mask, files.overlay) if path is not None]
     if files.aligned is not None:

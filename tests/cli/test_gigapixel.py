@@ -1,0 +1,129 @@
+"""What a pair of a gigapixel goes through, on a small one: the limit above which files are read by boxes is lowered.
+
+The pair is the one that scripts/gigapixel.py makes.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+import autoalign as aa
+from autoalign.files import large
+from autoalign.registration import large as large_module
+
+SIZE = (1_500, 1_100)
+SCRIPT = Path(__file__).parent.parent.parent / "scripts" / "gigapixel.py"
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("gigapixel", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.FINE = module.COARSE = 512  # texels: enough for so small a scene
+    return module
+
+
+@pytest.fixture(scope="module")
+def made(script, tmp_path_factory):
+    """The folder of the pair, and its truth."""
+    folder = tmp_path_factory.mktemp("made")
+    return folder, script.make_pair(folder, SIZE, 3)
+
+
+@pytest.fixture
+def both(made, folder, monkeypatch):
+    """The pair in the working folder, where it counts as large."""
+    for name in ("fixed.tif", "moving.tif"):
+        (folder / name).symlink_to(made[0] / name)
+    monkeypatch.setattr(large, "LARGE_PIXELS", 1e6)
+    monkeypatch.setattr(large, "WORKING_PIXELS", 4e5)
+    monkeypatch.setattr(large_module, "WORKING_PIXELS", 4e5)
+    return made[1]
+
+
+def test_it_is_aligned_as_well_as_a_small_one_and_drawn_the_same(both, folder, run, script, monkeypatch):
+    words = ("--border", "transparent", "--overlay", "look.jpg", "--save-mask", "data.tif")
+    outcome = run("pair", "fixed.tif", "moving.tif", "-o", "out.tif", *words)
+    assert outcome.code == 0
+    assert outcome.err == "wrote out.tif, data.tif, look.jpg, out.autoalign.json\n"
+    record = aa.read_sidecar("out.autoalign.json")
+    assert record.fixed.size == record.moving.size == SIZE
+    assert script.error_px(np.array(record.fixed_from_moving), both, SIZE) < 0.03
+    assert record.expected_error_px < 0.1
+    with tifffile.TiffFile("out.tif") as file:
+        assert file.is_bigtiff
+        assert [page.shape for page in file.pages] == [(1550, 2100, 4), (775, 1050, 4), (387, 525, 4)][
+            : len(file.pages)
+        ]
+        assert len(file.pages) > 1
+    assert aa.read_picture("look.jpg").pixels.shape[0] < SIZE[1] / 2
+
+    monkeypatch.setattr(large, "LARGE_PIXELS", 1e9)
+    assert (
+        run("apply", "out.autoalign.json", "moving.tif", "-o", "whole.tif", "--save-mask", "whole_mask.tif").code == 0
+    )
+    by_strips, whole = (aa.read_picture(name).pixels for name in ("out.tif", "whole.tif"))
+    difference = np.abs(by_strips.astype(int) - whole)
+    assert difference.max() <= 1
+    assert (difference > 0).mean() < 1e-3
+    assert (folder / "data.tif").exists()
+    assert np.array_equal(aa.read_picture("data.tif").pixels, by_strips[..., 3])
+    assert np.array_equal(aa.read_picture("data.tif").pixels, aa.read_picture("whole_mask.tif").pixels)
+
+
+def test_apply_draws_by_strips_what_pair_drew(both, folder, run):
+    points = "fixed_x,fixed_y,moving_x,moving_y\n10,20,0,0\n1490,30,1400,0\n1480,1080,1400,1000\n5,1090,0,1000\n"
+    (folder / "typed.csv").write_text(points)
+    run("pair", "fixed.tif", "moving.tif", "--points", "typed.csv", "-o", "out.tif", "--canvas", "inner")
+    assert run("apply", "out.autoalign.json", "moving.tif", "-o", "again.tif").code == 0
+    assert np.array_equal(aa.read_picture("again.tif").pixels, aa.read_picture("out.tif").pixels)
+
+
+def test_a_mask_hides_what_the_copies_show(both, run):
+    blind = np.full((SIZE[1], SIZE[0]), 255, np.uint8)
+    tifffile.imwrite("mask.tif", blind, tile=(256, 256))
+    assert run("pair", "fixed.tif", "moving.tif", "--fixed-mask", "mask.tif").code == 1
+    tifffile.imwrite("other.tif", blind[:-1], tile=(256, 256))
+    outcome = run("pair", "fixed.tif", "moving.tif", "--fixed-mask", "other.tif", "--overwrite")
+    assert outcome.code == 3
+    assert outcome.err == "autoalign: is 1500 x 1099, and a picture of 1500 x 1100 is needed: other.tif\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "reason"),
+    [
+        (["-o", "out.png"], 3, "a picture of so many pixels is written as TIFF: out.png"),
+        (["--save-mask", "mask.png"], 3, "a picture of so many pixels is written as TIFF: mask.png"),
+        (["--border", "replicate"], 2, "--border replicate needs the whole result at once, which is too large"),
+        (
+            ["--save-rrd", "a.rrd"],
+            2,
+            "pictures of so many pixels are not recorded for the viewer; --overlay shows them",
+        ),
+        (["--max-pixels", "1.5e6"], 3, "has 1.6 megapixels (1500 x 1100), more than the 1.5 allowed: fixed.tif"),
+    ],
+)
+def test_what_cannot_be_done_by_strips_is_said_at_once(both, folder, run, words, code, reason):
+    outcome = run("pair", "fixed.tif", "moving.tif", *words)
+    assert (outcome.code, outcome.err) == (code, f"autoalign: {reason}\n")
+    assert {path.name for path in folder.iterdir()} == {"fixed.tif", "moving.tif"}
+
+
+def test_a_damaged_tile_leaves_nothing(both, folder, run):
+    data = bytearray((folder / "moving.tif").read_bytes())
+    with tifffile.TiffFile(folder / "moving.tif") as file:
+        start = file.pages.first.dataoffsets[-1]
+    data[start : start + 100] = bytes(100)
+    (folder / "moving.tif").unlink()
+    (folder / "moving.tif").write_bytes(data)
+    outcome = run("pair", "fixed.tif", "moving.tif", "-o", "out.tif")
+    assert outcome.code == 3
+    assert outcome.err.startswith("autoalign: is damaged, or no TIFF that can be read (")
+    assert outcome.err.endswith("): moving.tif\n")
+    assert {path.name for path in folder.iterdir()} == {"fixed.tif", "moving.tif"}
