@@ -99,6 +99,18 @@ def test_colours_of_jpeg_2000_that_are_refused(tmp_path: Path, make_picture: Any
     assert "different size or depth" in refusal(tmp_path / "c.jp2")
 
 
+def test_missing_tiles_are_no_picture(tmp_path: Path, make_picture: Any) -> None:
+    Image.fromarray(make_picture(size=(80, 60))).save(tmp_path / "a.jp2", tile_size=(32, 32))
+    tiled = (tmp_path / "a.jp2").read_bytes()
+    np.testing.assert_array_equal(read_picture(tmp_path / "a.jp2").pixels, make_picture(size=(80, 60)))
+    start = tiled.index(b"\xff\x4f\xff\x51")
+    lying = tiled[: start + 8] + struct.pack(">I", 8000) + tiled[start + 12 :]
+    (tmp_path / "b.j2k").write_bytes(lying[start:])
+    assert "6 tiles where there should be 500" in refusal(tmp_path / "b.j2k")
+    (tmp_path / "b.jp2").write_bytes(lying)
+    assert "header does not say 8000 x 60" in refusal(tmp_path / "b.jp2")
+
+
 # JPEG XL
 
 

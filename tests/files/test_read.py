@@ -403,6 +403,19 @@ def test_bombs_cost_nothing(tmp_path: Path) -> None:
     assert time.perf_counter() - start < 0.5
 
 
+def test_jpeg_that_cannot_be_as_large_as_it_says(tmp_path: Path) -> None:
+    stream = encoded(Image.new("RGB", (64, 40)), "JPEG", progressive=True)
+    at = stream.index(b"\xff\xc2") + 5
+    (tmp_path / "a.jpg").write_bytes(stream[:at] + struct.pack(">HH", 9000, 9000) + stream[at + 4 :])
+    assert "81,000,000 pixels cannot be in" in refusal(tmp_path / "a.jpg")
+    large = encoded(Image.new("L", (9000, 9000)), "JPEG", quality=1)  # nothing is smaller than one colour
+    (tmp_path / "b.jpg").write_bytes(large)
+    assert read_picture(tmp_path / "b.jpg").pixels.shape == (9000, 9000)
+    scan = large[large.index(b"\xff\xda") : -2]
+    (tmp_path / "c.jpg").write_bytes(large[:-2] + scan * 80 + large[-2:])
+    assert "81 passes over 81,000,000 pixels" in refusal(tmp_path / "c.jpg")
+
+
 @pytest.mark.parametrize("extension", ["jpg", "png", "tif", "webp", "bmp", "avif"])
 def test_the_limit_is_the_callers(tmp_path: Path, extension: str) -> None:
     path = saved(tmp_path / f"a.{extension}", Image.new("RGB", (50, 30)))

@@ -34,6 +34,8 @@ GUID = 32  # hexadecimal digits
 MAX_BODY = 0xFFFF - 2  # a segment's length field counts itself
 INCHES_PER_UNIT = {1: 1.0, 2: 1 / 2.54}  # JFIF's density units; 0 is an aspect ratio
 MAX_DENSITY = 0xFFFF
+MAX_PIXELS_PER_BYTE = 8 * 64  # every block of 8 x 8 costs at least a bit
+MAX_SCANNED_PIXELS = 6e9  # a progressive JPEG has 10 to 20 scans
 
 
 def decoder(lenient: bool = False) -> Decoder:
@@ -66,8 +68,19 @@ def _read_header(data: bytes) -> Header:
     return Header(size=(w, h), orientation=exif_orientation(metadata.exif), metadata=metadata)
 
 
+def _check_work(pixels: int, data: bytes) -> None:
+    """Raise ValueError if the bytes cannot hold so many pixels, or would have them gone through too often."""
+    if pixels > MAX_PIXELS_PER_BYTE * len(data):
+        raise ValueError(f"{pixels:,} pixels cannot be in {len(data):,} bytes")
+    scans = data.count(bytes((0xFF, SCAN)))  # never among the pixels: there 0 follows 0xFF
+    if scans * pixels > MAX_SCANNED_PIXELS:
+        raise ValueError(f"{scans:,} passes over {pixels:,} pixels")
+
+
 def _decode(data: bytes, strict: bool) -> Picture:
-    grey = simplejpeg.decode_jpeg_header(data)[2] == "Gray"
+    h, w, colours, _ = simplejpeg.decode_jpeg_header(data)
+    _check_work(w * h, data)
+    grey = colours == "Gray"
     pixels: Picture = simplejpeg.decode_jpeg(data, colorspace="GRAY" if grey else "RGB", strict=strict)
     return pixels[..., 0] if grey else pixels
 

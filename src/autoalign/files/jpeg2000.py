@@ -16,6 +16,7 @@ from autoalign.files.metadata import Metadata, resolution
 from autoalign.picture.pixels import Picture, has_alpha, size_of
 
 CODESTREAM = b"\xff\x4f\xff\x51"  # its first two markers
+TILE_PART = b"\xff\x90"
 EXIF, XMP = uuid.UUID(bytes=b"JpgTiffExif->JP2"), uuid.UUID("be7acfcb-97a9-42e8-9c71-999491e3afac")
 ENUMERATED, ICC = 1, 2  # ways in which a colour box names its colours
 SRGB, GREY = 16, 17
@@ -31,6 +32,7 @@ class Codestream:
     size: tuple[int, int]
     channels: int
     bits: int  # of every channel
+    tiles: int
 
 
 def decoder() -> Decoder:
@@ -60,6 +62,9 @@ def _read_header(data: bytes) -> Header:
     if data.startswith(CODESTREAM):
         return Header(size=codestream.size, orientation=1, metadata=Metadata())
     head = next(bodies(data, b"jp2h"), b"")
+    w, h = codestream.size
+    if not next(bodies(head, b"ihdr"), b"").startswith(struct.pack(">II", h, w)):
+        raise ValueError(f"its header does not say {w} x {h}, its codestream does")
     if any(letters == b"pclr" for letters, _, _ in boxes(head)):
         raise Refused("has a palette, which is not read of JPEG 2000; convert it to RGB first")
     icc = None
@@ -75,7 +80,11 @@ def _read_header(data: bytes) -> Header:
 
 def _decode(data: bytes) -> Picture:
     # Of the codestream alone: a profile that lies around it would be applied to the pixels, and is kept instead.
-    return full_range(imagecodecs.jpeg2k_decode(_stream(data)), _codestream(data).bits)
+    stream, said = _stream(data), _codestream(data)
+    there = len(_tiles(stream))
+    if there != said.tiles:  # OpenJPEG would leave black what is missing
+        raise ValueError(f"{there} tiles where there should be {said.tiles}")
+    return full_range(imagecodecs.jpeg2k_decode(stream), said.bits)
 
 
 def _stream(data: bytes) -> bytes:
@@ -85,7 +94,8 @@ def _stream(data: bytes) -> bytes:
 def _codestream(data: bytes) -> Codestream:
     """Raises Refused if its pixels cannot become a picture, struct.error or StopIteration if it makes no sense."""
     stream = _stream(data)
-    right, bottom, left, top = struct.unpack_from(">4I", stream, 8)  # of the picture on its reference grid
+    # The picture, and the first of the tiles, on the reference grid.
+    right, bottom, left, top, tile_w, tile_h, tile_left, tile_top = struct.unpack_from(">8I", stream, 8)
     (channels,) = struct.unpack_from(">H", stream, 40)
     if not 1 <= channels <= 4:
         raise Refused(f"has {channels} channels that are not grey or RGB with or without alpha")
@@ -95,7 +105,26 @@ def _codestream(data: bytes) -> Codestream:
         raise Refused("has channels of different size or depth; convert it to RGB first")
     if depth & 0x80 or depth + 1 > 16:
         raise Refused(f"holds {'signed' if depth & 0x80 else depth + 1} bit pixels; autoalign takes up to 16 bits")
-    return Codestream(size=(right - left, bottom - top), channels=channels, bits=depth + 1)
+    return Codestream(
+        size=(right - left, bottom - top),
+        channels=channels,
+        bits=depth + 1,
+        tiles=-(-(right - tile_left) // tile_w) * -(-(bottom - tile_top) // tile_h),
+    )
+
+
+def _tiles(stream: bytes) -> set[int]:
+    """The numbers of the tiles of which there is a part, by the markers before them."""
+    at = 2
+    while stream[at : at + 2] != TILE_PART:
+        (length,) = struct.unpack_from(">H", stream, at + 2)
+        at += 2 + max(length, 2)
+    found = set()
+    while stream[at : at + 2] == TILE_PART:
+        number, length = struct.unpack_from(">HI", stream, at + 4)
+        found.add(number)
+        at += length if length >= 14 else len(stream)  # 0: to the end
+    return found
 
 
 def _read_dpi(head: bytes) -> tuple[float, float] | None:

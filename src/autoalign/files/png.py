@@ -69,10 +69,11 @@ def _decode(data: bytes) -> Picture:
 
 def _decode_leniently(data: bytes) -> Picture:
     """The rows that can be inflated, packed anew as a sound file."""
-    bodies: dict[bytes, bytes] = {}
+    pieces: dict[bytes, list[bytes]] = {}
     for kind, chunk in _chunks(data, lenient=True):
         if kind in PIXEL_CHUNKS:  # without the checksum: it is no longer asked
-            bodies[kind] = bodies.get(kind, b"") + chunk[8:-4].tobytes()
+            pieces.setdefault(kind, []).append(chunk[8:-4].tobytes())
+    bodies = {kind: b"".join(parts) for kind, parts in pieces.items()}
     w, h, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", bodies[b"IHDR"])
     if interlaced:
         raise ValueError("it is interlaced, so that no row is whole")
