@@ -58,10 +58,7 @@ def test_it_is_aligned_as_well_as_a_small_one_and_drawn_the_same(both, folder, r
     assert record.expected_error_px < 0.1
     with tifffile.TiffFile("out.tif") as file:
         assert file.is_bigtiff
-        assert [page.shape for page in file.pages] == [(1550, 2100, 4), (775, 1050, 4), (387, 525, 4)][
-            : len(file.pages)
-        ]
-        assert len(file.pages) > 1
+        assert [page.shape for page in file.pages] == [(1100, 1500, 4), (550, 750, 4)]
     assert aa.read_picture("look.jpg").pixels.shape[0] < SIZE[1] / 2
 
     monkeypatch.setattr(large, "LARGE_PIXELS", 1e9)

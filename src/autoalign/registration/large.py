@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from time import perf_counter
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from autoalign.registration.refine import Look, follow, in_grey_levels, pyramid
 from autoalign.registration.verdict import Sizes, judge, weigh
 
 WORKING_PIXELS = 16e6  # of each working copy
-PATCHES = 600  # read from the full pictures, at most
+PATCHES = 400  # read from the full pictures, at most
 _PLACED_ON = 1e6  # pixels of the copy on which patches were placed
 _SLACK = 4  # px around a patch for what the transform is still off
 
@@ -52,7 +53,9 @@ def align_large(
     sizes = Sizes(fixed=size_of(fixed.pixels), moving=size_of(moving.pixels))
     told = {id(of): in_pixels_of(of, fixed.copy.full_from_small, moving.copy.full_from_small) for of in small.attempts}
     if small.status != "rejected":
-        told[id(small.best)] = _sharpened(told[id(small.best)], fixed.pixels, moving.pixels, options)
+        started = perf_counter()
+        best = _sharpened(told[id(small.best)], fixed.pixels, moving.pixels, options)
+        told[id(small.best)] = replace(best, seconds=best.seconds | {"full size": perf_counter() - started})
     judged = {key: _judged(attempt, options, sizes) for key, attempt in told.items()}
     return Alignment(
         fixed_size=sizes.fixed,
