@@ -105,12 +105,19 @@ def planned(
     return Plan(tasks=tasks, done=len(keyed) - len(tasks))
 
 
-def carry_out(plan: Plan, ledger: Ledger, engine: Engine, *, fail_fast: bool = False) -> Iterator[Row]:
+def carry_out(
+    plan: Plan,
+    ledger: Ledger,
+    engine: Engine,
+    *,
+    fail_fast: bool = False,
+    function: Callable[[Task], Done] = do_task,
+) -> Iterator[Row]:
     """Do what is to be done, and yield each row once the ledger has it. What an engine loses stays to be done.
 
-    With `fail_fast` no further than the first row that failed. Raises EngineError if there is nowhere to run.
+    With `fail_fast` no further than the first row that failed; `function` is what workers call. Raises EngineError if there is nowhere to run.
     """
-    for outcome in engine.run(do_task, plan.tasks):
+    for outcome in engine.run(function, plan.tasks):
         if outcome.casualty is not None and outcome.casualty.cause == "lost":
             continue
         done = _done(outcome)
