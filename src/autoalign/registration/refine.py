@@ -34,6 +34,8 @@ from autoalign.registration.patches import RIM, Comparison, compare
 _COMMON_BIAS = 0.25  # sigmas that all keypoints may be off together: ORB's corners are whole pixels
 _SCOUTS = 400  # patches that lead the way, at least
 _CORNER_PIXELS = 1e6  # corners are looked for in a picture that is halved to at most so many
+_LEADING_STEPS = 4  # of the least squares, while a new look corrects them anyway,
+_LAST_STEPS = 30  # and when none will
 _HELD_OUT = 5  # every fifth patch judges
 
 
@@ -126,7 +128,8 @@ def follow(
     rounds = [(look, scouts, False) for look in [looks[0], *looks]] + [(finest, everyone, True)] * options.rounds
     for look, chosen, cubic in rounds:
         seen = look(transform, chosen, cubic)
-        moved = _fit(model, transform, seen, _usable(seen, options) & np.isin(chosen, leaders))
+        used = _usable(seen, options) & np.isin(chosen, leaders)
+        moved = _fit(model, transform, seen, used, _LAST_STEPS if cubic else _LEADING_STEPS)
         if moved is None:
             return unchanged
         transform = moved
@@ -237,11 +240,11 @@ def _usable(seen: Comparison, options: RefineOptions) -> Mask:
     )
 
 
-def _fit(model: Model, transform: Array, seen: Comparison, used: Mask) -> Array | None:
+def _fit(model: Model, transform: Array, seen: Comparison, used: Mask, steps: int) -> Array | None:
     """Robust least squares on some of the patches; None where they are too few to trust."""
     if used.sum() < 3 * model.degrees_of_freedom:
         return None
-    return polish(model, transform, seen.pairs[used], sigma_floor=0.02)
+    return polish(model, transform, seen.pairs[used], sigma_floor=0.02, max_steps=steps)
 
 
 def _helped(before: Array, after: Array) -> bool:
