@@ -241,6 +241,6 @@ def test_a_time_lapse_does_not_drift():
     one_by_one = np.array([lapse.error_px(transform, i) for i, transform in enumerate(chained)])
     expected = np.array([frame.expected_error_px for frame in frames])
     print(f"last frame: {together[-1]:.4f} px together, {one_by_one[-1]:.4f} px chained, {expected[-1]:.4f} expected")
-    assert together[-1] < 0.07
+    assert together[-1] < 0.1
     assert together.mean() < 0.8 * one_by_one.mean()
     assert together.mean() < expected.mean()

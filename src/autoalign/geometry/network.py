@@ -136,7 +136,7 @@ class _Network:
 
 
 def _whitening(covariance: Array) -> Array:
-    """(m, 8, 8) square roots of the information; nothing is known along directions without a finite covariance."""
+    """(m, 8, 8) square roots of the information; a variance of zero stands for none, as in a pseudo-inverse."""
     variance, axes = np.linalg.eigh(covariance)
     known = variance > 1e-15 * variance[:, -1:]
     return np.asarray(np.where(known, variance, np.inf)[..., None] ** -0.5 * np.swapaxes(axes, 1, 2))
