@@ -102,6 +102,23 @@ def test_what_is_not_large_or_no_tiff_is_left_to_others(tmp_path):
             assert large is None
 
 
+def test_a_line_is_left_to_others(tmp_path):
+    path = write(tmp_path / "a.tif", picture()[:20], tile=(64, 128))
+    with opened_large(path, above_pixels=1, max_pixels=1e9) as large:
+        assert large is None
+
+
+def test_a_header_that_lies_about_the_size_is_refused(tmp_path):
+    path = write(tmp_path / "a.tif", picture(), tile=(64, 128), compression="zlib")
+    with tifffile.TiffFile(path, mode="r+") as file:
+        file.pages.first.tags["ImageLength"].overwrite(50_000)
+    with (
+        pytest.raises(ImageReadError, match="12 tiles or strips, where there should be 2346"),
+        opened_large(path, above_pixels=1, max_pixels=1e9),
+    ):
+        pytest.fail("opened")
+
+
 def test_a_lone_compressed_strip_is_not_read_by_boxes(tmp_path, monkeypatch):
     monkeypatch.setattr(tiled, "MAX_TILE_PIXELS", W * 100)
     path = write(tmp_path / "a.tif", picture(), rowsperstrip=H, compression="zlib")

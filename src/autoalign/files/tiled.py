@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import mmap
 import os
 import re
@@ -32,6 +33,7 @@ from autoalign.picture.pixels import Picture, PixelSource, Shrunken, resize_map,
 CACHE_BYTES = 192 * 2**20  # of decoded tiles: a strip of a turned gigapixel passes through some hundred of them
 THREADS = 2  # that decode; more would only wait for the warper
 MAX_TILE_PIXELS = 2**25  # a page in larger pieces is not read box by box
+MIN_SIDE = 64  # px; nor is one that is thinner: its working copy would be as large as itself
 BARE_ROWS = 64  # of pixels that are not compressed, that are read at once
 JPEGS = (6, 7, 33007, 34892)  # compressions whose tiles share tables
 
@@ -156,8 +158,8 @@ def opened_large(
 ) -> Iterator[LargePicture | None]:
     """A page of a TIFF with more than `above_pixels` pixels, open to be read box by box; None for anything else.
 
-    None as well for one that is stored lying or mirrored, which would have to be turned as a whole, and for one that is
-    compressed in one piece. Raises
+    None as well for one that is stored lying or mirrored, which would have to be turned as a whole, for one that is
+    compressed in one piece, and for a mere line. Raises
     ImageReadError, one line with the path last, if there is no such file, or it is such a TIFF and has more than
     `max_pixels` pixels, is cut short, or is of a kind that autoalign does not take.
     """
@@ -196,8 +198,9 @@ def _large_page(stack: ExitStack, file: BufferedReader, number: int, above_pixel
         page: Any = stack.enter_context(tifffile.TiffFile(file)).pages[number]
         lies = tiff.tag(page, "Orientation", 1) in range(2, 9)
         rows, columns = _tile_of(page)
-        is_large = page.imagewidth * page.imagelength > above_pixels
-        return page if is_large and not lies and rows * columns <= MAX_TILE_PIXELS else None
+        w, h = page.imagewidth, page.imagelength
+        by_boxes = rows * columns <= MAX_TILE_PIXELS and min(w, h) >= MIN_SIDE and not lies
+        return page if w * h > above_pixels and by_boxes else None
     except Exception:  # `read_picture`, which comes next, says what is wrong with the file
         return None
 
@@ -222,6 +225,9 @@ def _check(page: Any, file: BufferedReader, max_pixels: float, path: Path) -> No
     try:
         tiff.check_readable(page)
         check_size((page.imagewidth, page.imagelength), max_pixels)
+        pieces = page.dataoffsets
+        if not _is_bare(page) and len(pieces) != math.prod(page.chunked):
+            raise ValueError(f"{len(pieces)} tiles or strips, where there should be {math.prod(page.chunked)}")
         end = file.seek(0, os.SEEK_END)
         if max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True))) > end:
             raise EOFError("the file is shorter than its header says")
