@@ -163,9 +163,7 @@ def test_alpha_is_not_lost(tmp_path: Path, make_picture: Any, extension: str, ch
 
 
 def test_sides_that_a_format_cannot_count(tmp_path: Path) -> None:
-    assert "70000 x 1 uint8 pixels; PNG or TIFF or BMP or" in refusal(
-        tmp_path / "a.jpg", np.zeros((1, 70_000), "u1")
-    )
+    assert "70000 x 1 uint8 pixels; PNG or TIFF or BMP or" in refusal(tmp_path / "a.jpg", np.zeros((1, 70_000), "u1"))
     for extension, w in ((".webp", 16_383), (".jpg", 65_500)):
         write_picture(tmp_path / f"a{extension}", np.zeros((1, w), np.uint8))
         assert read_picture(tmp_path / f"a{extension}").pixels.shape[:2] == (1, w)
@@ -174,9 +172,7 @@ def test_sides_that_a_format_cannot_count(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["a", "a.gif", "a.heic", "a.jpg.bak"])
 def test_unknown_extension(tmp_path: Path, make_picture: Any, name: str) -> None:
     message = refusal(tmp_path / name, make_picture())
-    assert (
-        "has an extension that autoalign does not write (.jpg, .jpeg, .png, .tif, .tiff, .webp, .bmp" in message
-    )
+    assert "has an extension that autoalign does not write (.jpg, .jpeg, .png, .tif, .tiff, .webp, .bmp" in message
 
 
 def test_extensions_in_capitals(tmp_path: Path, make_picture: Any) -> None:
