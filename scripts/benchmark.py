@@ -34,7 +34,10 @@ STAGES = ("detect", "match", "consensus", "refine", "verdict")
 
 
 def photograph(file: Path | None, megapixels: float) -> np.ndarray:
-    """An RGB picture of about 4 : 3 with detail at every scale: the photograph, tiled if it is too small."""
+    """An RGB picture of about 4 : 3 with detail at every scale: the photograph.
+
+    One that is too small is enlarged, which is nowhere the same twice, and tiled, which is sharp; half of either.
+    """
     if file is None:
         from skimage import data
 
@@ -42,13 +45,12 @@ def photograph(file: Path | None, megapixels: float) -> np.ndarray:
     else:
         source = read_picture(file).pixels[..., :3]
     w, h = (round((megapixels * 1e6 * r) ** 0.5) for r in (4 / 3, 3 / 4))
-    if source.shape[0] < h * 0.7:
-        times = int(np.ceil(h * 0.7 / source.shape[0]))
-        source = np.concatenate([np.roll(source, 37 * k, axis=1) for k in range(times)], axis=0)
-        source = np.concatenate([np.roll(source, 53 * k, axis=0)[:, :: (-1) ** k] for k in range(times)], axis=1)
-    return np.asarray(
-        cv2.resize(source, (w, h), interpolation=cv2.INTER_AREA if source.shape[0] > h else cv2.INTER_CUBIC)
-    )
+    if source.shape[0] >= h * 0.7:
+        return np.asarray(cv2.resize(source, (w, h), interpolation=cv2.INTER_AREA))
+    times = int(np.ceil(max(h / source.shape[0], w / source.shape[1])))
+    tiled = np.concatenate([np.roll(source, 37 * k, axis=1) for k in range(times)], axis=0)
+    tiled = np.concatenate([np.roll(tiled, 53 * k, axis=0)[:, :: (-1) ** k] for k in range(times)], axis=1)
+    return cv2.addWeighted(cv2.resize(source, (w, h), interpolation=cv2.INTER_CUBIC), 0.5, tiled[:h, :w], 0.5, 0)
 
 
 def make_pair(folder: Path, file: Path | None, megapixels: float) -> tuple[Path, Path, np.ndarray]:
