@@ -7,8 +7,8 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from autoalign import __version__
 from autoalign.errors import ImageReadError
 from autoalign.files.read import ReadOptions
 from autoalign.files.write import default_output
-from autoalign.picture.border import like_bordered
+from autoalign.picture.border import Border, like_bordered
 from autoalign.picture.pixels import Picture, has_alpha
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
@@ -52,25 +52,26 @@ class Job:
     moving_mask: str | None = None
     placed: SequenceFrame | None = None  # where a whole sequence puts it; None where that is to be found out
 
-    @property
+    @cached_property
     def output(self) -> Path:
         """The aligned picture: the moving one's name and format, or a format that can be written behind its name."""
-        like = like_bordered(GREY_PIXEL, self.options.drawing.border)
-        suffix = default_output(self.name, like if has_alpha(like) else None).suffix
-        path = Path(self.out_dir, *PurePosixPath(self.name).parts)
-        return path if path.suffix == suffix else path.with_name(path.name + suffix)
+        extension = os.path.splitext(self.name)[1]
+        written = _written_extension(extension, self.options.drawing.border)
+        return self._below("" if written == extension else written)
 
-    @property
+    @cached_property
     def sidecar(self) -> Path:
         """With the whole name, because a camera writes IMG_1.CR2 and IMG_1.JPG into one folder."""
-        return self._beside(".autoalign.json")
+        return self._below(".autoalign.json")
 
-    @property
+    @cached_property
     def recording(self) -> Path:
-        return self._beside(".autoalign.rrd")
+        """For the viewer, if it is wanted."""
+        return self._below(".autoalign.rrd")
 
     @property
     def inputs(self) -> tuple[str, ...]:
+        """All that it reads."""
         return tuple(path for path in (self.fixed, self.moving, self.fixed_mask, self.moving_mask) if path)
 
     @property
@@ -78,8 +79,15 @@ class Job:
         """All that it may write."""
         return self.output, self.sidecar, self.recording
 
-    def _beside(self, ending: str) -> Path:
-        return Path(self.out_dir, *PurePosixPath(self.name + ending).parts)
+    def _below(self, ending: str) -> Path:
+        return Path(self.out_dir, self.name + ending)
+
+
+@lru_cache
+def _written_extension(extension: str, border: Border) -> str:
+    """The extension of a format that can be written, and that can hold what the border needs."""
+    like = like_bordered(GREY_PIXEL, border)
+    return default_output(f"name{extension}", like if has_alpha(like) else None).suffix
 
 
 def rooted(job: Job) -> Job:

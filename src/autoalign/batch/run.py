@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from autoalign.batch.engine import Engine, LocalEngine
@@ -57,13 +58,14 @@ def feature_store(out_dir: Path, cache: Path | None) -> Iterator[Path]:
 
 def by_key(jobs: Sequence[Job], hash_of: Callable[[str], str]) -> dict[str, Job]:
     """The jobs by their keys. Raises ValueError if two would write the same file, or one of them an input."""
-    inputs = {_absolute(path) for job in jobs for path in job.inputs}
-    for path, count in Counter(_absolute(path) for job in jobs for path in job.outputs).items():
+    inputs = {os.path.abspath(path) for path in {path for job in jobs for path in job.inputs}}
+    for path, count in Counter(os.path.abspath(path) for job in jobs for path in job.outputs).items():
         if count > 1:
             raise ValueError(f"two pictures of the batch have the same name, and would both be written to: {path}")
         if path in inputs:
             raise ValueError(f"is an input, and a result would overwrite it: {path}")
-    return {key(job, readable(hash_of)): job for job in jobs}
+    known = cache(readable(hash_of))  # a reference is asked for as often as there are pictures
+    return {key(job, known): job for job in jobs}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +96,7 @@ def planned(
     mine = {job.name for job in jobs}
     rows = [row for row in ledger.rows() if row.name in mine]
     ledger.reopen(row.name for row in rows if _is_gone(row, out_dir) or (options.retry and row.status == "failed"))
-    _sweep({job.output.parent for job in jobs})
+    _sweep({os.path.dirname(job.output) for job in jobs})
     uses = Counter(path for job in jobs for path in job.inputs)
     again = options.again or frozenset(path for path, count in uses.items() if count > 1)
     tasks = tuple(
@@ -115,7 +117,8 @@ def carry_out(
 ) -> Iterator[Row]:
     """Do what is to be done, and yield each row once the ledger has it. What an engine loses stays to be done.
 
-    With `fail_fast` no further than the first row that failed; `function` is what workers call. Raises EngineError if there is nowhere to run.
+    With `fail_fast` no further than the first row that failed; `function` is what workers call. Raises EngineError if
+    there is nowhere to run.
     """
     for outcome in engine.run(function, plan.tasks):
         if outcome.casualty is not None and outcome.casualty.cause == "lost":
@@ -144,16 +147,12 @@ def _check_strangers(jobs: Iterable[Job], known: set[str]) -> None:
     """Raise ImageWriteError, the path last, for a file in the way of a job that the ledger has never heard of."""
     for job in jobs:
         for path in job.outputs if job.name not in known else ():
-            if path.exists():
+            if os.path.exists(path):
                 raise ImageWriteError(f"exists already, and is no result of this batch: {path}")
 
 
-def _sweep(folders: Iterable[Path]) -> None:
+def _sweep(folders: Iterable[str]) -> None:
     """Take away what writers that were killed left behind."""
     for folder in folders:
-        for path in folder.glob(TEMPORARY.format("*")):
+        for path in Path(folder).glob(TEMPORARY.format("*")):
             path.unlink(missing_ok=True)
-
-
-def _absolute(path: str | Path) -> str:
-    return os.path.abspath(path)
