@@ -14,7 +14,7 @@ from autoalign.batch.work import Task
 from autoalign.errors import ImageReadError
 from autoalign.registration.align import align
 from autoalign.registration.drawing import Drawing
-from autoalign.registration.sequence import Link, SequenceOptions, link_of, links, solve_sequence
+from autoalign.registration.sequence import Link, link_of, links, solve_sequence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ def link_up(frames: Sequence[Job], reference: int, ledger: Ledger, engine: Engin
         yield _from_text(text, outcome.job)
 
 
-def place(frames: Sequence[Job], reference: int, linked: Sequence[Linked], options: SequenceOptions) -> list[Job]:
+def place(frames: Sequence[Job], reference: int, linked: Sequence[Linked]) -> list[Job]:
     """The frames with the places that all links together give them.
 
     A frame of which no size is known, because it cannot be read, counts as large as the reference: it is rejected here,
@@ -67,7 +67,8 @@ def place(frames: Sequence[Job], reference: int, linked: Sequence[Linked], optio
             if size is not None:
                 known[frame] = size
     sizes = [known.get(frame, known.get(reference, (1, 1))) for frame in range(len(frames))]
-    solved = solve_sequence(len(frames), reference, [one.link for one in linked], sizes, options)
+    verdict = frames[reference].options.align.verdict
+    solved = solve_sequence(len(frames), reference, [one.link for one in linked], sizes, verdict=verdict)
     return [replace(job, placed=frame) for job, frame in zip(frames, solved, strict=True)]
 
 

@@ -28,7 +28,7 @@ from autoalign.files.read import ReadOptions, read_text
 from autoalign.files.row import Row
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
-from autoalign.registration.sequence import SequenceOptions, links
+from autoalign.registration.sequence import links
 
 STDIN = Path("-")
 MAX_MANIFEST_BYTES = 1 << 28
@@ -183,7 +183,7 @@ def _placed(
         for one in link_up(frames, reference, ledger, engine, store):
             linked.append(one)
             follow(one.link.status)
-    return place(frames, reference, linked, SequenceOptions())
+    return place(frames, reference, linked)
 
 
 def _tell_end(rows: Sequence[Row], total: int, plan_done: int, seconds: float, common: Common) -> None:

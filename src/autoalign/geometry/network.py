@@ -199,13 +199,14 @@ def _coordinates(transforms: Array) -> Array:
 
     The last entry of no generator is other than zero, so it fixes the scale.
     """
-    return np.einsum("gij,mij->mg", _ALONG, transforms / transforms[:, 2:, 2:] - IDENTITY)
+    return np.asarray(np.einsum("gij,mij->mg", _ALONG, transforms / transforms[:, 2:, 2:] - IDENTITY))
 
 
 def _slope(transforms: Array, velocity: Array) -> Array:
     """(m, 8, dof) derivative of the coordinates of transforms (m, 3, 3) that move by `velocity` (m, dof, 3, 3)."""
     scale = transforms[:, None, 2:, 2:]
-    return np.einsum("gij,mdij->mgd", _ALONG, velocity / scale - transforms[:, None] * velocity[..., 2:, 2:] / scale**2)
+    change = velocity / scale - transforms[:, None] * velocity[..., 2:, 2:] / scale**2
+    return np.asarray(np.einsum("gij,mdij->mgd", _ALONG, change))
 
 
 def _graduated(network: _Network, transforms: Array, threshold: float, max_steps: int) -> Array:
