@@ -5,6 +5,7 @@ Files are read back by another library than the one that wrote them, where one c
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,14 @@ def test_what_came_in_comes_out(tmp_path: Path, make_picture: Any, format: Forma
         assert exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSLatitude] == LATITUDE
 
 
+def typed_shift(folder: Path, dx: int, dy: int) -> Path:
+    """A file of correspondences that say where the moving picture lies."""
+    lines = [f"{x + dx},{y + dy},{x},{y}" for x, y in ((0, 0), (50, 0), (50, 30), (0, 30))]
+    path = folder / "points.csv"
+    path.write_text("\n".join(["fixed_x,fixed_y,moving_x,moving_y", *lines]))
+    return path
+
+
 @pytest.mark.parametrize(
     ("extension", "write"),
     [
@@ -135,10 +144,7 @@ def test_files_of_others_through_the_command(
     pixels[..., 3] = 255
     path = tmp_path / f"moving{extension}"
     write(path, pixels)
-    points = tmp_path / "points.csv"
-    corners = [(0, 0), (50, 0), (50, 30), (0, 30)]
-    lines = [f"{x + SHIFT[0]},{y + SHIFT[1]},{x},{y}" for x, y in corners]
-    points.write_text("\n".join(["fixed_x,fixed_y,moving_x,moving_y", *lines]))
+    points = typed_shift(tmp_path, *SHIFT)
     fixed = tmp_path / "fixed.png"
     Image.fromarray(pixels).save(fixed)
     assert main(["pair", str(fixed), str(path), "--points", str(points), "--model", "translation", "-q"]) == 0
@@ -148,3 +154,26 @@ def test_files_of_others_through_the_command(
     tolerance = 6 if extension in (".jpg", ".avif") else 1e-6
     difference = np.abs(back[SHIFT[1] + 8 :, SHIFT[0] + 8 :].astype(float) - stored[8 : -SHIFT[1], 8 : -SHIFT[0]])
     assert difference.max() <= tolerance
+
+
+@pytest.mark.parametrize(("canvas", "tie"), [("fixed", (0, 0)), ("union", (3, 2)), ("moving", (3, 2))])
+def test_scan_on_a_map_is_a_map_on_any_canvas(
+    tmp_path: Path, make_picture: Any, canvas: str, tie: tuple[int, int]
+) -> None:
+    pixels = make_picture(channels=3, size=(53, 34), smooth=True)
+    place = [(33550, 12, 3, (0.5, 0.5, 0.0), True), (33922, 12, 6, (0.0, 0.0, 0.0, 4e5, 5e6, 0.0), True)]
+    place += [(34735, 3, 8, (1, 1, 0, 1, 3072, 0, 1, 32632), True)]
+    tifffile.imwrite(tmp_path / "map.tif", pixels, photometric="rgb", extratags=place)
+    lying = Image.fromarray(pixels).transpose(Image.Transpose.ROTATE_90)  # its EXIF says how to turn it back
+    lying.save(tmp_path / "scan.jpg", quality=95, exif=b"Exif\0\0" + camera_exif())
+    points = typed_shift(tmp_path, -3, -2)
+    words = ["pair", "map.tif", "scan.jpg", "--points", points.name, "--model", "translation", "-o", "out.tif", "-q"]
+    with contextlib.chdir(tmp_path):
+        assert main([*words, "--canvas", canvas]) == 0
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        page = file.pages.first
+        assert page.geotiff_tags["ModelTiepoint"] == [*tie, 0, 4e5, 5e6, 0]
+        assert page.geotiff_tags["ModelPixelScale"] == [0.5, 0.5, 0]
+        assert page.geotiff_tags["ProjectedCSTypeGeoKey"] == 32632
+        assert page.tags["GPSTag"].value["GPSLatitude"][::2] == (47, 22, 67)
+        assert page.tags["Orientation"].value == 1
