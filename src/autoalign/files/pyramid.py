@@ -20,8 +20,10 @@ from autoalign.files.write import blaming, file_atomically
 from autoalign.picture.pixels import Picture, PixelSource, halve, size_of
 
 TILE = 512  # px; strips that are written have so many rows
+PART = 8 * TILE  # px of a strip that are made smaller at once
 SMALLEST = 1024  # px; no overview is made of what is not larger
 THREADS = 2  # that compress
+BUFFER_BYTES = 2**24  # of tiles that are compressed side by side
 LEVEL = 1  # of deflate: six times as fast as the usual 6, and less than a tenth larger
 
 Strips = Iterator[Picture]
@@ -59,6 +61,7 @@ def _write_page(writer: tifffile.TiffWriter, strips: Strips, like: PixelSource, 
         dtype=like.dtype,
         tile=(TILE, TILE),
         maxworkers=THREADS,
+        buffersize=BUFFER_BYTES,
         compressionargs={"level": LEVEL},
         **tiff.how_stored(like),
         **words,
@@ -69,7 +72,7 @@ def _write_overview(writer: tifffile.TiffWriter, file: BinaryIO, path: Path) -> 
     """Append the last page made half as large, and return its shape."""
     file.flush()
     with tifffile.TiffFile(file.name) as written:
-        larger = TiledPixels(written.pages[-1], path)
+        larger = TiledPixels(written.pages[-1], path, cache_bytes=0)  # no tile is asked for twice
         try:
             shape = (larger.shape[0] // 2, larger.shape[1] // 2, *larger.shape[2:])
             like = np.broadcast_to(np.zeros((), larger.dtype), shape)
@@ -83,7 +86,9 @@ def _halved(larger: PixelSource) -> Strips:
     """A picture half as large, a last odd row and column left out, strip by strip."""
     h, w = larger.shape[0] & ~1, larger.shape[1] & ~1
     for row in range(0, h, 2 * TILE):
-        yield halve(larger[slice(row, min(row + 2 * TILE, h)), slice(0, w)]).pixels
+        rows = slice(row, min(row + 2 * TILE, h))
+        parts = [halve(larger[rows, slice(x, min(x + PART, w))]).pixels for x in range(0, w, PART)]
+        yield np.concatenate(parts, axis=1)
 
 
 def _tiles(strips: Strips) -> Iterator[Picture]:

@@ -30,7 +30,7 @@ from autoalign.files.metadata import Metadata, describing
 from autoalign.files.read import check_size, opened
 from autoalign.picture.pixels import Picture, PixelSource, Shrunken, resize_map, size_of, working_copy
 
-CACHE_BYTES = 192 * 2**20  # of decoded tiles: a strip of a turned gigapixel passes through some hundred of them
+CACHE_BYTES = 160 * 2**20  # of decoded tiles: a strip of a turned gigapixel passes through some hundred of them
 THREADS = 2  # that decode; more would only wait for the warper
 MAX_TILE_PIXELS = 2**25  # a page in larger pieces is not read box by box
 MIN_SIDE = 64  # px; nor is one that is thinner: its working copy would be as large as itself
@@ -61,6 +61,7 @@ class LargePicture:
         enough = [level for level in self.overviews if level.shape[0] * level.shape[1] >= max_pixels]
         level = min(enough, key=lambda one: one.shape[0], default=self.pixels)
         small = working_copy(level, max_pixels)
+        level.forget()
         full_from_level = resize_map(_covered(level, self.pixels), size_of(level))
         return Shrunken(pixels=small.pixels, full_from_small=full_from_level @ small.full_from_small)
 
@@ -103,6 +104,10 @@ class TiledPixels:
     def close(self) -> None:
         """End the threads and forget the tiles."""
         self._pool.shutdown(wait=True, cancel_futures=True)
+        self.forget()
+
+    def forget(self) -> None:
+        """Keep no tile any longer."""
         self._kept.clear()
 
     def _places(self, y0: int, y1: int, x0: int, x1: int) -> Iterator[tuple[int, slice, int, int]]:
@@ -123,7 +128,7 @@ class TiledPixels:
             tiles[index] = self._kept.pop(index) if index in self._kept else futures[index].result()
             self._kept[index] = tiles[index]  # as the one used last
         total = sum(tile.nbytes for tile in self._kept.values())
-        while total > self._cache_bytes and len(self._kept) > 1:
+        while total > self._cache_bytes:
             total -= self._kept.popitem(last=False)[1].nbytes
         return tiles
 
