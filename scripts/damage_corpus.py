@@ -1,6 +1,6 @@
 """Damaged and hostile files of every format, read under limits: none may crash, hang, swell, or pass for another.
 
-    python scripts/damage_corpus.py [--count 560] [--seed 1] [--workers 2] [--keep FOLDER]
+    python scripts/damage_corpus.py [--count 620] [--seed 1] [--workers 2] [--keep FOLDER]
 
 Sound files of all formats are cut short, bits are turned, blocks zeroed, sizes in headers replaced by lies; to these
 come bombs, endless chains, wrong names and empty files, all from one seed. Each is read in a worker process that is
@@ -29,6 +29,8 @@ from pathlib import Path
 import cv2
 import imagecodecs
 import numpy as np
+import pillow_heif
+import rawpy
 import tifffile
 from PIL import Image
 
@@ -93,8 +95,36 @@ def sound_files() -> dict[str, bytes]:
         "plain.avif": pillow("AVIF", quality=85),
         "plain.jp2": bytes(imagecodecs.jpeg2k_encode(rgb, level=0, reversible=True, codecformat="JP2")),
         "bare.jxl": bytes(imagecodecs.jpegxl_encode(rgb, level=90, usecontainer=False)),
+        "plain.heic": _heic(image),
+        "plain.dng": camera_dng(),
         "boxed.jxl": bytes(imagecodecs.jpegxl_encode(deep, lossless=True, effort=1, usecontainer=True)),
     }
+
+
+def camera_dng(orientation: int = 1) -> bytes:
+    """The smallest DNG that LibRaw develops: a red, green and blue mosaic, brighter to the right."""
+    mosaic = np.broadcast_to(np.linspace(1000, 60_000, 64).astype(np.uint16), (48, 64)).copy()
+    stream = io.BytesIO()
+    extra = [
+        (50706, 1, 4, (1, 4, 0, 0), True),  # DNGVersion
+        (50708, 2, 0, "Camera 3000", True),  # UniqueCameraModel
+        (271, 2, 0, "Maker", True),
+        (272, 2, 0, "Camera 3000", True),
+        (274, 3, 1, orientation, True),
+        (33421, 3, 2, (2, 2), True),  # CFARepeatPatternDim
+        (33422, 1, 4, (0, 1, 1, 2), True),  # CFAPattern
+        (50721, 10, 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),  # ColorMatrix1
+        (50728, 5, 3, (1, 1, 1, 1, 1, 1), True),  # AsShotNeutral
+        (50717, 4, 1, 65_535, True),  # WhiteLevel
+    ]
+    tifffile.imwrite(stream, mosaic, photometric="cfa", extratags=extra, metadata=None)
+    return stream.getvalue()
+
+
+def _heic(image: Image.Image) -> bytes:
+    stream = io.BytesIO()
+    pillow_heif.from_pillow(image).save(stream, quality=85)
+    return stream.getvalue()
 
 
 # Damages: (content, random numbers) to content
@@ -193,7 +223,8 @@ def hostile_files() -> dict[str, bytes]:
         "fill.jpg": b"\xff\xd8" + b"\xff" * 3_000_000,
         "segments.jpg": b"\xff\xd8" + b"\xff\xe1\0\2" * 200_000 + sound["baseline.jpg"][2:],
         "boxes.jp2": sound["plain.jp2"][:32] + box(b"free", b"") * 100_000 + sound["plain.jp2"][32:],
-        "packed.jxl": sound["boxed.jxl"] + box(b"brob", b"Exif" + bytes(imagecodecs.brotli_encode(bytes(1 << 27), level=1))),
+        "packed.jxl": sound["boxed.jxl"]
+        + box(b"brob", b"Exif" + bytes(imagecodecs.brotli_encode(bytes(1 << 27), level=1))),
         "deep.webp": sound["lossless.webp"] + bytes(1_000_000),
     }
 
@@ -321,11 +352,16 @@ def reference(path: Path) -> np.ndarray:
     data = path.read_bytes()
     if b"\xff\x0a" in data[:64] and b"PNG" not in data[:8]:
         return np.asarray(imagecodecs.jpegxl_decode(data, index=0))
+    if path.suffix == ".dng":
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            return np.asarray(raw.postprocess(output_bps=16, use_camera_wb=True, no_auto_bright=True))
     if data[:2] in (b"II", b"MM"):
         return np.asarray(tifffile.imread(io.BytesIO(data), key=0))
     if data.startswith(b"\x89PNG"):
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if pixels.ndim == 3 else pixels)
+    if path.suffix == ".heic":
+        return np.array(pillow_heif.open_heif(io.BytesIO(data))[0])
     with Image.open(io.BytesIO(data)) as image:
         return np.asarray(image.convert({"1": "L", "P": "RGB"}.get(image.mode, image.mode)))
 
@@ -360,7 +396,7 @@ def run(count: int, seed: int, workers: int, folder: Path) -> dict[Case, str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=560)
+    parser.add_argument("--count", type=int, default=620)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="folder for the files; by default they are deleted")

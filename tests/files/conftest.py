@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -28,3 +31,10 @@ def make_picture() -> MakePicture:
         return picture[..., 0] if channels == 1 else picture
 
     return make
+
+
+@pytest.fixture
+def damage_corpus(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The script that makes damaged files, under its own name, by which workers import it."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
+    return importlib.import_module("damage_corpus")

@@ -2,31 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-
-import pytest
-
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+from types import ModuleType
 
 
-@pytest.fixture
-def damage_corpus(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))  # the workers import the script by its name
-    import damage_corpus
-
-    yield damage_corpus
-    sys.modules.pop("damage_corpus", None)
-
-
-def test_nothing_crashes_hangs_swells_or_passes_for_another(damage_corpus, tmp_path: Path) -> None:
+def test_nothing_crashes_hangs_swells_or_passes_for_another(damage_corpus: ModuleType, tmp_path: Path) -> None:
     found = damage_corpus.run(count=64, seed=2, workers=2, folder=tmp_path)
     assert len(found) == 64
     assert {case.path.name: verdict for case, verdict in found.items() if verdict not in damage_corpus.GOOD} == {}
     assert sum(verdict == "refused" for verdict in found.values()) > 20
 
 
-def test_the_same_seed_damages_alike(damage_corpus, tmp_path: Path) -> None:
+def test_the_same_seed_damages_alike(damage_corpus: ModuleType, tmp_path: Path) -> None:
     contents = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

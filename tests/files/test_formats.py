@@ -6,12 +6,13 @@ import io
 import struct
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import imagecodecs
 import numpy as np
+import pillow_heif
 import pytest
-import tifffile
 from PIL import Image, ImageCms
 
 from autoalign.errors import ImageReadError, ImageWriteError
@@ -246,10 +247,9 @@ def test_missing_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, librar
 @pytest.mark.parametrize("bits", [8, 10])
 @pytest.mark.parametrize("channels", [3, 4])
 def test_heic(tmp_path: Path, make_picture: Any, bits: int, channels: int) -> None:
-    heif = pytest.importorskip("pillow_heif")
     pixels = make_picture(np.uint8 if bits == 8 else np.uint16, channels, size=(96, 64), smooth=True)
     mode = {3: "RGB", 4: "RGBA"}[channels] + ("" if bits == 8 else ";16")
-    image = heif.from_bytes(mode=mode, size=(96, 64), data=pixels.tobytes())
+    image = pillow_heif.from_bytes(mode=mode, size=(96, 64), data=pixels.tobytes())
     image.save(tmp_path / "a.heic", quality=100, chroma=444, exif=exif_block(6), icc_profile=PROFILE, xmp=XMP)
     loaded = read_picture(tmp_path / "a.heic")
     pixels = upright(pixels, 6)  # the orientation became a turn of the file's own
@@ -264,30 +264,9 @@ def test_heic(tmp_path: Path, make_picture: Any, bits: int, channels: int) -> No
     assert "is damaged" in refusal(tmp_path / "c.heic")
 
 
-def camera_dng(orientation: int) -> bytes:
-    """The smallest DNG that LibRaw develops: a red, green and blue mosaic, brighter to the right."""
-    mosaic = np.broadcast_to(np.linspace(1000, 60_000, 64).astype(np.uint16), (48, 64)).copy()
-    stream = io.BytesIO()
-    extra = [
-        (50706, 1, 4, (1, 4, 0, 0), True),  # DNGVersion
-        (50708, 2, 0, "Camera 3000", True),  # UniqueCameraModel
-        (271, 2, 0, "Maker", True),
-        (272, 2, 0, "Camera 3000", True),
-        (274, 3, 1, orientation, True),
-        (33421, 3, 2, (2, 2), True),  # CFARepeatPatternDim
-        (33422, 1, 4, (0, 1, 1, 2), True),  # CFAPattern
-        (50721, 10, 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),  # ColorMatrix1
-        (50728, 5, 3, (1, 1, 1, 1, 1, 1), True),  # AsShotNeutral
-        (50717, 4, 1, 65_535, True),  # WhiteLevel
-    ]
-    tifffile.imwrite(stream, mosaic, photometric="cfa", extratags=extra, metadata=None)
-    return stream.getvalue()
-
-
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_dng(tmp_path: Path, orientation: int) -> None:
-    pytest.importorskip("rawpy")
-    (tmp_path / "a.dng").write_bytes(camera_dng(orientation))
+def test_dng(tmp_path: Path, damage_corpus: ModuleType, orientation: int) -> None:
+    (tmp_path / "a.dng").write_bytes(damage_corpus.camera_dng(orientation))
     loaded = read_picture(tmp_path / "a.dng")
     w, h = (64, 48) if orientation < 5 else (48, 64)
     assert loaded.pixels.shape == (h, w, 3)

@@ -403,6 +403,12 @@ def test_bombs_cost_nothing(tmp_path: Path) -> None:
     assert time.perf_counter() - start < 0.5
 
 
+def test_endless_file(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.bmp", Image.new("RGB", (50, 30)))
+    os.truncate(path, 20_000_000_000)  # a hole, which takes no room
+    assert "is larger than the 0.1 GB that a picture as large as allowed takes" in refusal(path, max_pixels=1500)
+
+
 def test_jpeg_that_cannot_be_as_large_as_it_says(tmp_path: Path) -> None:
     stream = encoded(Image.new("RGB", (64, 40)), "JPEG", progressive=True)
     at = stream.index(b"\xff\xc2") + 5

@@ -18,7 +18,7 @@ import numpy as np
 from autoalign.errors import ImageReadError
 from autoalign.files.codec import Decoder, Header, Refused, one_line
 from autoalign.files.formats import HEAD_BYTES, LENIENT, Format, decoder_for, of_bytes
-from autoalign.files.metadata import Metadata, describing, turned
+from autoalign.files.metadata import MAX_METADATA, Metadata, describing, turned
 from autoalign.picture.pixels import Picture, size_of
 
 
@@ -45,6 +45,7 @@ class ReadOptions:
 
 
 MAX_PIXELS = 300e6
+MAX_BYTES_PER_PIXEL = 16  # four channels of float32, not compressed
 
 
 def read_picture(path: str | Path, options: ReadOptions = ReadOptions(), *, page: int = 0) -> LoadedPicture:
@@ -57,8 +58,13 @@ def read_picture(path: str | Path, options: ReadOptions = ReadOptions(), *, page
     path = Path(path)
     with opened(path) as file:
         format = _format(file.read(HEAD_BYTES), path)
+        most = int(MAX_BYTES_PER_PIXEL * (options.max_pixels or MAX_PIXELS)) + MAX_METADATA
         file.seek(0)
-        data = file.read()
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise ImageReadError(
+            f"is larger than the {most / 1e9:,.1f} GB that a picture as large as allowed takes: {path}"
+        )
     header, pixels, remark = _decoded(data, format, page, options, path)
     return LoadedPicture(
         pixels=pixels,
