@@ -10,6 +10,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from os import SEEK_END
 from pathlib import Path
 from typing import BinaryIO
 
@@ -59,12 +60,11 @@ def read_picture(path: str | Path, options: ReadOptions = ReadOptions(), *, page
     with opened(path) as file:
         format = _format(file.read(HEAD_BYTES), path)
         most = int(MAX_BYTES_PER_PIXEL * (options.max_pixels or MAX_PIXELS)) + MAX_METADATA
+        if file.seek(0, SEEK_END) > most:
+            size = f"{most / 1e9:,.1f} GB"
+            raise ImageReadError(f"is larger than the {size} that a picture as large as allowed takes: {path}")
         file.seek(0)
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise ImageReadError(
-            f"is larger than the {most / 1e9:,.1f} GB that a picture as large as allowed takes: {path}"
-        )
+        data = file.read()
     header, pixels, remark = _decoded(data, format, page, options, path)
     return LoadedPicture(
         pixels=pixels,
