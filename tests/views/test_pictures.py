@@ -13,7 +13,7 @@ from skimage import data
 import autoalign as aa
 from autoalign.files.jpeg import decoder
 from autoalign.files.metadata import Metadata
-from autoalign.files.read import LoadedPicture
+from autoalign.files.read import LoadedPicture, ReadOptions
 from autoalign.files.write import write_picture
 from autoalign.geometry.homography import IDENTITY, scaling, translation
 from autoalign.views import pictures
@@ -75,6 +75,15 @@ def test_files_that_no_viewer_decodes_are_encoded(extension: str, photo: np.ndar
     write_picture(path, photo)
     loaded = aa.read_picture(path)
     assert abs(decoded(as_shown(loaded.pixels, "photo", original_bytes(loaded)).picture) - photo).mean() < 5
+
+
+def test_a_damaged_file_is_shown_as_it_was_read(photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "photo.png"
+    write_picture(path, photo)
+    path.write_bytes(path.read_bytes()[:-5000])
+    loaded = aa.read_picture(path, ReadOptions(lenient=True))
+    assert original_bytes(loaded) is None
+    assert abs(decoded(as_shown(loaded.pixels, "photo").picture) - loaded.pixels).mean() < 5
 
 
 def test_other_depths_are_stretched_and_this_is_said(photo: np.ndarray) -> None:

@@ -74,7 +74,9 @@ class _Both:
 
 
 def original_bytes(loaded: LoadedPicture) -> bytes | None:
-    """The file's bytes, if they still are those that were read."""
+    """The file's bytes, if a viewer may decode them, and they still are those that were read."""
+    if loaded.remark or loaded.format not in {format.name for format in _MEDIA_TYPES}:
+        return None
     try:
         data = loaded.path.read_bytes()
     except OSError:
