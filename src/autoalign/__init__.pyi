@@ -8,11 +8,11 @@ from .errors import AlignmentError as AlignmentError
 from .errors import AutoalignError as AutoalignError
 from .errors import CanvasError as CanvasError
 from .errors import EngineError as EngineError
-from .errors import EngineError as EngineError
 from .errors import ImageReadError as ImageReadError
 from .errors import ImageWriteError as ImageWriteError
 from .files.points import read_points as read_points
 from .files.points import write_points as write_points
+from .files.read import ReadOptions as ReadOptions
 from .files.read import read_picture as read_picture
 from .files.row import Row as Row
 from .files.sidecar import Sidecar as Sidecar
