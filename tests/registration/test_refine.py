@@ -69,16 +69,29 @@ def test_a_consensus_off_by_a_part_of_a_pixel_comes_back_to_the_truth(name, spre
     assert mean_error_px(result.fixed_from_moving, of) < GOOD_PX
 
 
-@pytest.mark.parametrize("patches", [60, 2500])
-def test_any_number_of_patches_will_do(patches):
+@pytest.mark.parametrize(("patches", "radius"), [(60, 12), (2500, 6)])
+def test_any_number_of_patches_will_do(patches, radius):
     """With very few, the truth is a little less sharp: noise falls with the square root of their number."""
     of = pair("gravel.png", translation(6.3, 4.8), (496, 470))
     matched = keypoints(of, 1.0)
-    result = refine(of.fixed, of.moving, consensus(of, matched, "affine"), matched, RefineOptions(patches=patches))
+    result = refine(
+        of.fixed, of.moving, consensus(of, matched, "affine"), matched, RefineOptions(patches=patches, radius=radius)
+    )
     assert result.sharpened
     assert result.patches is not None
     assert len(result.patches.kept) > min(0.8 * patches, 2000)
     assert mean_error_px(result.fixed_from_moving, of) < GOOD_PX
+
+
+def test_patches_keep_apart_so_that_their_errors_are_independent():
+    """The choice of the model and the expected error count them so."""
+    of = pair("gravel.png", translation(6.3, 4.8), (496, 470))
+    matched = keypoints(of, 1.0)
+    result = refine(of.fixed, of.moving, consensus(of, matched, "affine"), matched, RefineOptions(radius=10))
+    at = result.pairs.dst
+    distance = np.linalg.norm(at[:, None] - at[None], axis=2)[~np.eye(len(at), dtype=bool)]
+    assert len(at) > 500
+    assert distance.min() >= 10
 
 
 @pytest.mark.parametrize("offset", [(0.2, 0.0), (-0.15, 0.12)])

@@ -32,6 +32,7 @@ from autoalign.picture.pixels import Picture, Shrunken, halve, size_of, to_8_bit
 from autoalign.registration.patches import RIM, Comparison, compare
 
 _COMMON_BIAS = 0.25  # sigmas that all keypoints may be off together: ORB's corners are whole pixels
+_FEW = 300  # patches; where there is no room for so many side by side, they may overlap more
 _SCOUTS = 400  # patches that lead the way, at least
 _CORNER_PIXELS = 1e6  # corners are looked for in a picture that is halved to at most so many
 _LEADING_STEPS = 4  # of the least squares, while a new look corrects them anyway,
@@ -216,7 +217,9 @@ def _corners(
     halvings = max(0, int(np.ceil(np.log2(fixed.size / _CORNER_PIXELS) / 2)))
     small = pyramid(fixed, halvings, 0)[0]
     w, h = size_of(small.pixels)
-    apart = max(4.0, np.sqrt(w * h / options.patches) * 0.6)
+    # Patches nearer than their radius see the same noise, and would be counted as if they did not.
+    spread, scarce = (np.sqrt(w * h / count) * 0.6 for count in (options.patches, _FEW))
+    apart = max(4.0, spread, min(options.radius / small.full_from_small[0, 0], scarce))
     usable, moving_usable = masks
     mask = None if usable is None else cv2.resize(usable.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
     found = cv2.goodFeaturesToTrack(to_8_bit(small.pixels), 3 * options.patches, 0.003, apart, mask=mask, blockSize=7)
