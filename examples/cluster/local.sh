@@ -9,15 +9,19 @@ set -eu
 folder=$(mktemp -d)
 export DASK_TEMPORARY_DIRECTORY="$folder"
 scheduler_file=$folder/scheduler.json
-trap 'kill $children 2>/dev/null; wait; rm -rf "$folder"' EXIT
+# The worker first: one that loses its scheduler while it is being ended may wait for ever.
+trap 'kill $worker 2>/dev/null; wait $worker; kill $scheduler 2>/dev/null; wait; rm -rf "$folder"' EXIT
 trap 'exit 130' INT TERM
 
 dask scheduler --host 127.0.0.1 --port 0 --no-dashboard --scheduler-file "$scheduler_file" &
-children=$!
+scheduler=$!
 # Two threads: two jobs at a time. No nanny, because a worker under one may have no processes of its own.
 dask worker --scheduler-file "$scheduler_file" --nthreads 2 --no-nanny --no-dashboard &
-children="$children $!"
-until [ -s "$scheduler_file" ]; do sleep 0.1; done
+worker=$!
+until [ -s "$scheduler_file" ]; do
+    kill -0 "$scheduler" "$worker"  # or there is nothing to wait for
+    sleep 0.1
+done
 
 AUTOALIGN_SCHEDULER=$(sed -n 's/.*"address": "\([^"]*\)".*/\1/p' "$scheduler_file")
 export AUTOALIGN_SCHEDULER
