@@ -87,7 +87,7 @@ def kill_workers(folder: Path, options: argparse.Namespace, seconds: float, rng:
     """One run, whose workers are killed; the pairs that they had become failures, which a second run does again."""
     process, killed = start(folder, "workers", options.workers), 0
     while process.poll() is None and killed < options.kills:
-        time.sleep(rng.uniform(0, 1.5 * seconds / options.kills))
+        time.sleep(rng.uniform(0, seconds / options.kills))
         workers = [child for child in descendants(process.pid) if child.cpu_times().user > 0]
         if workers:
             workers[int(rng.integers(len(workers)))].kill()
