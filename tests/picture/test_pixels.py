@@ -10,6 +10,7 @@ from autoalign.picture import pixels as pixels_module
 from autoalign.picture.pixels import (
     check_picture,
     grey,
+    halve,
     has_alpha,
     in_colour,
     opaque,
@@ -164,3 +165,17 @@ def test_a_source_is_asked_for_every_pixel_once():
 
     working_copy(Source(), 5_000)
     assert (asked[:300, :400] == 1).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("size", [(8, 6), (9, 7), (1, 6), (9, 1), (1, 1)])
+def test_halve_is_the_mean_of_two_by_two_where_it_says(size, dtype):
+    """A ramp tells where a mean was taken; a lone row or column stands for two."""
+    x, y = np.meshgrid(*(np.arange(s) for s in size))
+    half = halve((4 * x + 20 * y).astype(dtype))
+    w, h = size_of(half.pixels)
+    assert half.pixels.dtype == dtype
+    assert (w, h) == tuple(max(s // 2, 1) for s in size)
+    columns, rows = np.meshgrid(np.arange(w), np.arange(h))
+    there = apply(half.full_from_small, np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64))
+    assert np.allclose(half.pixels.ravel(), there @ (4, 20))
