@@ -73,12 +73,13 @@ def place(frames: Sequence[Job], reference: int, linked: Sequence[Linked]) -> li
 
 
 def _task(frames: Sequence[Job], fixed: int, moving: int, ledger: Ledger, store: Path) -> Task:
-    """The job of aligning two frames, how they are drawn left out: it has no part in where they go."""
+    """The job of aligning two frames, without how they are drawn and kept, which has no part in where they go."""
     job = replace(
         frames[moving],
         fixed=frames[fixed].moving,
         fixed_mask=frames[fixed].moving_mask,
         options=replace(frames[moving].options, drawing=Drawing(), fixed_page=frames[moving].options.moving_page),
+        upload=None,
     )
     return Task(job=job, key=key(job, readable(ledger.hash_of)), store=str(store), again=frozenset(job.inputs))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from autoalign import __version__
 from autoalign.errors import ImageReadError
 from autoalign.files.read import ReadOptions
+from autoalign.files.remote import below, is_url, path_of
 from autoalign.files.write import default_output
 from autoalign.picture.border import Border, like_bordered
 from autoalign.picture.pixels import Picture, has_alpha
@@ -44,13 +45,14 @@ class Job:
     """One moving picture, the fixed one it goes onto, and where the result goes."""
 
     name: str  # unique in its batch: the moving picture's path below the batch's folder, with slashes
-    fixed: str  # a path
+    fixed: str  # a path or a URL
     moving: str
     out_dir: str
     options: JobOptions = JobOptions()
     fixed_mask: str | None = None  # a picture that is not black where the fixed one is to be ignored
     moving_mask: str | None = None
     placed: SequenceFrame | None = None  # where a whole sequence puts it; None where that is to be found out
+    upload: str | None = None  # URL below which its files are put as well
 
     @cached_property
     def output(self) -> Path:
@@ -79,6 +81,18 @@ class Job:
         """All that it may write."""
         return self.output, self.sidecar, self.recording
 
+    @property
+    def places(self) -> Iterator[str]:
+        """The `place` of all that it may write or upload."""
+        for path in self.outputs:
+            yield place(str(path))
+            if self.upload:
+                yield place(below(self.upload, self.within(path)))
+
+    def within(self, output: Path) -> str:
+        """The name of one of its outputs in the batch's folder, with slashes."""
+        return output.relative_to(self.out_dir).as_posix()
+
     def _below(self, ending: str) -> Path:
         return Path(self.out_dir, self.name + ending)
 
@@ -90,19 +104,25 @@ def _written_extension(extension: str, border: Border) -> str:
     return default_output(f"name{extension}", like if has_alpha(like) else None).suffix
 
 
+def place(path: str) -> str:
+    """Equal for the paths, or for the URLs, of one file, however they are written."""
+    return str(path_of(path)) if is_url(path) else os.path.abspath(path)
+
+
 def rooted(job: Job) -> Job:
     """The job with absolute paths, for workers that are not in the working folder of this process."""
     paths = {name: getattr(job, name) for name in ("fixed", "moving", "out_dir", "fixed_mask", "moving_mask")}
-    return replace(job, **{name: os.path.abspath(path) for name, path in paths.items() if path})
+    return replace(job, **{name: os.path.abspath(path) for name, path in paths.items() if path and not is_url(path)})
 
 
 def key(job: Job, hash_of: Callable[[str], str]) -> str:
     """Hexadecimal name of a job: equal exactly where inputs, options and version, and so the results, are equal.
 
-    `hash_of` gives the hash of the content behind a path.
+    It is another where the results are to be uploaded to another place. `hash_of` gives the hash of the content behind
+    a path or URL.
     """
     inputs = [path and hash_of(path) for path in (job.fixed, job.moving, job.fixed_mask, job.moving_mask)]
-    words = [job.name, *(word or "" for word in inputs), _digest(job.options), _place(job.placed)]
+    words = [job.name, *(word or "" for word in inputs), _digest(job.options), _place(job.placed), job.upload or ""]
     return hashlib.sha256("\0".join(words).encode("utf-8", "surrogateescape")).hexdigest()
 
 

@@ -34,6 +34,8 @@ from autoalign.batch.schema import (
 )
 from autoalign.errors import AutoalignError, ImageReadError, ImageWriteError
 from autoalign.files.codec import one_line
+from autoalign.files.remote import hash_of as hash_of_url
+from autoalign.files.remote import is_url
 from autoalign.files.row import ROW_STATUSES, Row, RowStatus, Thumbnails
 
 FILE_NAME = "autoalign.sqlite"
@@ -260,8 +262,10 @@ class Ledger(LedgerReader):
     def hash_of(self, path: str | Path) -> str:
         """SHA-256 of a file's bytes, in hexadecimal; from memory if neither size, time stamp nor inode have changed.
 
-        Raises ImageReadError, the path last.
+        Of a URL, the hash of what its server says of its version, if it does. Raises ImageReadError, the path last.
         """
+        if is_url(str(path)):
+            return hash_of_url(str(path))
         path = os.path.abspath(path)
         try:
             state = _state(path)

@@ -6,6 +6,7 @@ import csv
 import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -13,24 +14,27 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from autoalign.batch.jobs import Job, JobOptions
 from autoalign.errors import ImageReadError
 from autoalign.files.formats import of_name
+from autoalign.files.remote import check_url, is_local, is_url, path_of
 
-NEEDED, MASKS = ("fixed", "moving"), ("fixed_mask", "moving_mask")
-OWN = (*NEEDED, "name", *MASKS)
+NEEDED = ("fixed", "moving")
+PICTURES = (*NEEDED, "fixed_mask", "moving_mask")
+OWN = (*PICTURES, "name")
 
 
 def manifest_jobs(text: str, source: str, base: Path, out_dir: Path, options: JobOptions) -> list[Job]:
     """The rows of a CSV with the columns fixed, moving and, if wanted, name, fixed_mask, moving_mask and options.
 
-    Paths are relative to `base`. An option's column has the option's name, with - or _, and an empty cell leaves that
-    option as `options` have it. A picture without a name is called by its path below the folder that the moving
-    pictures share. Raises ImageReadError with the line, `source` last, for what cannot be understood.
+    Paths are relative to `base`, and may be URLs. An option's column has the option's name, with - or _, and an empty
+    cell leaves that option as `options` have it. A picture without a name is called by its path below the folder that
+    the moving pictures share. Raises ImageReadError with the line, `source` last, for what cannot be understood; or
+    with a URL last, where the package for it is missing.
     """
     try:
-        rows = list(_rows(text))
+        rows = [(line, _located(line, row, base)) for line, row in _rows(text)]
         if not rows:
             raise ValueError("has no rows")
-        names = _names([_absolute(base, row["moving"]) for _, row in rows])
-        return [_job(line, row, name, base, out_dir, options) for (line, row), name in zip(rows, names, strict=True)]
+        names = _names([_path(row["moving"]) for _, row in rows])
+        return [_job(line, row, name, out_dir, options) for (line, row), name in zip(rows, names, strict=True)]
     except (ValueError, csv.Error) as error:
         raise ImageReadError(f"is no manifest ({error}): {source}") from None
 
@@ -65,38 +69,59 @@ def _columns(names: Sequence[str]) -> list[str]:
     return columns
 
 
-def _job(line: int, row: Mapping[str, str], name: str, base: Path, out_dir: Path, options: JobOptions) -> Job:
-    try:
+def _located(line: int, row: Mapping[str, str], base: Path) -> dict[str, str]:
+    """The row with absolute paths, or URLs."""
+    with _in_line(line):
         missing = [column for column in NEEDED if column not in row]
         if missing:
             raise ValueError(f"{missing[0]} is empty")
-        masks = {column: _absolute(base, row[column]) if column in row else None for column in MASKS}
+        return {column: _absolute(base, cell) if column in PICTURES else cell for column, cell in row.items()}
+
+
+def _job(line: int, row: Mapping[str, str], name: str, out_dir: Path, options: JobOptions) -> Job:
+    with _in_line(line):
         return Job(
-            name=_inside(_with_extension(row.get("name", name), row["moving"])),
-            fixed=_absolute(base, row["fixed"]),
-            moving=_absolute(base, row["moving"]),
+            name=_inside(_with_extension(row.get("name", name), _path(row["moving"]))),
+            fixed=row["fixed"],
+            moving=row["moving"],
             out_dir=str(out_dir),
             options=with_cells(options, {key: cell for key, cell in row.items() if key not in OWN}),
-            fixed_mask=masks["fixed_mask"],
-            moving_mask=masks["moving_mask"],
+            fixed_mask=row.get("fixed_mask"),
+            moving_mask=row.get("moving_mask"),
         )
+
+
+@contextmanager
+def _in_line(line: int) -> Iterator[None]:
+    """What is wrong there, with the number of the line."""
+    try:
+        yield
     except ValueError as error:
         raise ValueError(f"line {line}: {error}") from None
 
 
-def _names(paths: Sequence[str]) -> list[str]:
+def _names(paths: Sequence[Path]) -> list[str]:
     """What pictures are called if the manifest does not say: their paths below the folder that they share."""
-    shared = os.path.commonpath([os.path.dirname(path) for path in paths])
-    return [Path(path).relative_to(shared).as_posix() for path in paths]
+    shared = os.path.commonpath([path.parent for path in paths])
+    return [path.relative_to(shared).as_posix() for path in paths]
 
 
-def _absolute(base: Path, path: str) -> str:
-    return os.path.normpath(base / path)
+def _absolute(base: Path, address: str) -> str:
+    """Where a picture is. Raises ValueError for a URL that nothing can be fetched from."""
+    if not is_url(address):
+        return os.path.normpath(base / address)
+    check_url(address)
+    return str(path_of(address)) if is_local(address) else address
 
 
-def _with_extension(name: str, moving: str) -> str:
+def _path(address: str) -> Path:
+    """What names a picture from the root on, wherever it is."""
+    return path_of(address) if is_url(address) else Path(address)
+
+
+def _with_extension(name: str, moving: Path) -> str:
     """A result has the moving picture's format, unless its name says another."""
-    return name if of_name(Path(name)) else name + Path(moving).suffix
+    return name if of_name(Path(name)) else name + moving.suffix
 
 
 def _inside(name: str) -> str:

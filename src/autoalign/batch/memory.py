@@ -9,7 +9,8 @@ from pathlib import Path
 
 from autoalign.files.feature_store import recall_from
 from autoalign.files.read import LoadedPicture, ReadOptions, read_picture
-from autoalign.files.sized import read_mask
+from autoalign.files.remote import is_url, read_url, shown, version_of
+from autoalign.files.sized import as_mask
 from autoalign.picture.pixels import size_of
 from autoalign.registration.prepared import Prepared, prepare
 
@@ -32,7 +33,7 @@ class Ready:
 class Source:
     """Where a picture is, and what of it is taken."""
 
-    path: str
+    path: str  # or a URL
     mask: str | None = None  # a picture of the same size that is not black where this one is to be ignored
     page: int = 0
     reading: ReadOptions = ReadOptions()
@@ -62,16 +63,22 @@ class PictureMemory:
 
 
 def _read(source: Source, store: str | None) -> Ready:
-    loaded = read_picture(source.path, source.reading, page=source.page)
-    hidden = read_mask(Path(source.mask), size_of(loaded.pixels)) if source.mask else None
+    loaded = _loaded(source.path, source.reading, source.page)
+    hidden = as_mask(_loaded(source.mask), size_of(loaded.pixels), shown(source.mask)) if source.mask else None
     identity = f"{loaded.sha256} {source.page} {source.reading.lenient} {hidden.sha256 if hidden else ''}"
     valid = hidden.valid if hidden else None
     recall = recall_from(Path(store), identity) if store else None
     return Ready(loaded=loaded, prepared=prepare(loaded.pixels, valid, recall=recall))
 
 
-def _stamp(path: str) -> tuple[int, ...] | None:
+def _loaded(path: str, reading: ReadOptions = ReadOptions(), page: int = 0) -> LoadedPicture:
+    return (read_url if is_url(path) else read_picture)(path, reading, page=page)
+
+
+def _stamp(path: str) -> object:
     """What changes with a file's content; None for a file that is not there, which reading it will say."""
+    if is_url(path):
+        return version_of(path) or object()  # which equals no other: what cannot be told apart is fetched again
     try:
         found = os.stat(path)
     except (OSError, ValueError):

@@ -6,21 +6,24 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from autoalign.batch.engine import Engine, LocalEngine
-from autoalign.batch.jobs import Job, key, readable
+from autoalign.batch.jobs import Job, key, place, readable
 from autoalign.batch.ledger import Entry, Ledger
 from autoalign.batch.slot import Outcome
 from autoalign.batch.work import Done, Task, do_task, failed_row
 from autoalign.errors import ImageWriteError
+from autoalign.files.remote import is_url, shown
 from autoalign.files.row import Row
 from autoalign.files.write import TEMPORARY
 
 STORE_NAME = ".autoalign-features"
+REQUESTS = 16  # at a time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +61,16 @@ def feature_store(out_dir: Path, cache: Path | None) -> Iterator[Path]:
 
 def by_key(jobs: Sequence[Job], hash_of: Callable[[str], str]) -> dict[str, Job]:
     """The jobs by their keys. Raises ValueError if two would write the same file, or one of them an input."""
-    inputs = {os.path.abspath(path) for path in {path for job in jobs for path in job.inputs}}
-    for path, count in Counter(os.path.abspath(path) for job in jobs for path in job.outputs).items():
+    inputs = {path for job in jobs for path in job.inputs}
+    taken = {place(path): path for path in inputs}
+    for path, count in Counter(path for job in jobs for path in job.places).items():
         if count > 1:
             raise ValueError(f"two pictures of the batch have the same name, and would both be written to: {path}")
-        if path in inputs:
-            raise ValueError(f"is an input, and a result would overwrite it: {path}")
+        if path in taken:
+            raise ValueError(f"is an input, and a result would overwrite it: {shown(taken[path])}")
     known = cache(readable(hash_of))  # a reference is asked for as often as there are pictures
+    with ThreadPoolExecutor(REQUESTS) as pool:
+        pool.map(known, filter(is_url, inputs))  # an answer from far away takes its time
     return {key(job, known): job for job in jobs}
 
 
@@ -91,7 +97,9 @@ def planned(
     keyed = by_key(jobs, ledger.hash_of)
     if not options.overwrite:
         _check_strangers(jobs, ledger.names())
-    entries = (Entry(key=of, name=job.name, fixed=job.fixed, moving=job.moving) for of, job in keyed.items())
+    entries = (
+        Entry(key=of, name=job.name, fixed=shown(job.fixed), moving=shown(job.moving)) for of, job in keyed.items()
+    )
     ledger.plan(entries, more=options.more)
     mine = {job.name for job in jobs}
     rows = [row for row in ledger.rows() if row.name in mine]

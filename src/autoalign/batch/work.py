@@ -12,6 +12,7 @@ from autoalign.batch.memory import PictureMemory, Ready, Source
 from autoalign.errors import CanvasError, ImageReadError, ImageWriteError
 from autoalign.files.read import LoadedPicture
 from autoalign.files.record import placed_record, record
+from autoalign.files.remote import shown, upload
 from autoalign.files.result import ResultFiles, write_result
 from autoalign.files.row import Row, Thumbnails
 from autoalign.files.sidecar import Sidecar, transform_of, write_sidecar
@@ -68,6 +69,7 @@ def do_task(task: Task) -> Done:
         fixed, moving = task.ready()
         found = _find(job, fixed, moving)
         written = _write(job, found, fixed.loaded, moving.loaded)
+        _upload(job, written)
     except (ImageReadError, ImageWriteError, CanvasError, ValueError) as error:
         return Done(row=failed_row(job, str(error)))
     transform = None if found.kept.fixed_from_moving is None else transform_of(found.kept)
@@ -79,7 +81,7 @@ def failed_row(job: Job, reason: str) -> Row:
     """The row of a job that could not be tried or finished; nothing of an earlier run may pass for its result."""
     for path in job.outputs:
         path.unlink(missing_ok=True)
-    return Row(name=job.name, fixed=job.fixed, moving=job.moving, status="failed", reason=reason)
+    return Row(name=job.name, fixed=shown(job.fixed), moving=shown(job.moving), status="failed", reason=reason)
 
 
 @cache
@@ -120,12 +122,19 @@ def _write(job: Job, found: _Found, fixed: LoadedPicture, moving: LoadedPicture)
     return written
 
 
+def _upload(job: Job, written: Iterable[Path]) -> None:
+    """Put the files of a pair where they are wanted as well, the sidecar last: where it is, the others are."""
+    if job.upload:
+        for path in sorted(written, key=lambda path: path == job.sidecar):
+            upload(path, job.upload, job.within(path))
+
+
 def _row(job: Job, found: _Found, written: Iterable[Path]) -> Row:
-    kept, names = found.kept, {path: path.relative_to(job.out_dir).as_posix() for path in written}
+    kept, names = found.kept, {path: job.within(path) for path in written}
     return Row(
         name=job.name,
-        fixed=job.fixed,
-        moving=job.moving,
+        fixed=shown(job.fixed),
+        moving=shown(job.moving),
         status=kept.status,
         reason=kept.reason,
         expected_error_px=kept.expected_error_px,

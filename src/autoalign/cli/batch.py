@@ -14,7 +14,7 @@ from cyclopts import Parameter
 
 from autoalign.batch.chain import link_up, place
 from autoalign.batch.engine import Engine
-from autoalign.batch.jobs import Job, JobOptions, Recorded, rooted
+from autoalign.batch.jobs import Job, JobOptions, Recorded
 from autoalign.batch.ledger import FILE_NAME as LEDGER
 from autoalign.batch.ledger import Ledger, LedgerReader
 from autoalign.batch.manifest import manifest_jobs
@@ -22,9 +22,10 @@ from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
 from autoalign.batch.sources import Selection, in_groups, onto_reference, pictures, place_of_reference
 from autoalign.batch.telling import write_reports
 from autoalign.cli.progress import clock, following, tally
-from autoalign.cli.running import RUNNING, Running, engine_of, in_words, make_folder
+from autoalign.cli.running import RUNNING, Running, engine_of, for_running, in_words, make_folder, upload_reports
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
 from autoalign.files.read import ReadOptions, read_text
+from autoalign.files.remote import shown
 from autoalign.files.row import Row
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
@@ -86,8 +87,7 @@ def batch(
     started = time.monotonic()
     wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
     jobs, reference = _jobs(source, files, selection, wanted)
-    if running.scheduler:
-        jobs = [rooted(job) for job in jobs]
+    jobs = for_running(jobs, running)
     if again.plan:
         return _tell_plan(jobs, reference, files.out_dir)
     make_folder(files.out_dir)
@@ -108,6 +108,7 @@ def batch(
         reports = write_reports(files.out_dir, ledger, about, sequence=files.sequence, recorded=True)
     _tell_end(rows, len(jobs), plan.done, time.monotonic() - started, common)
     note(f"wrote {', '.join(map(str, reports))}", common)
+    upload_reports(reports, running)
     return _exit(rows, len(jobs))
 
 
@@ -167,7 +168,7 @@ def _tell_plan(jobs: Sequence[Job], reference: int | None, out_dir: Path) -> Exi
             known = {row.name: row.status for row in ledger.rows()}
     for job in jobs:
         before = f" ({known[job.name]} before)" if job.name in known else ""
-        print(f"{job.moving} -> {job.fixed}: {job.output}{before}")
+        print(f"{shown(job.moving)} -> {shown(job.fixed)}: {job.output}{before}")
     again = sum(job.name in known for job in jobs)
     chained = f", after {len(links(len(jobs), reference)):,} links between frames" if reference is not None else ""
     tell(f"{len(jobs):,} pairs{chained}; {again:,} were done before, and only those that changed will be done again")

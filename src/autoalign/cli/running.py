@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from cyclopts import Group
 
 from autoalign.batch.engine import Engine, LocalEngine
+from autoalign.batch.jobs import Job, rooted
 from autoalign.batch.slot import Limits
 from autoalign.errors import EngineError, ImageWriteError
+from autoalign.files.remote import check_upload, upload
 
 RUNNING = Group("Running", sort_key=1.5)
 GB = 1e9
@@ -30,6 +33,8 @@ class Running:
     """gigabytes of memory at which a pair is given up"""
     cache: Path | None = None
     """folder to keep the keypoints of all pictures in, for other batches"""
+    upload: str | None = None
+    """URL (s3://, gs://, az://, abfss:// or file://) below which all that is written is put as well"""
 
 
 def engine_of(running: Running) -> Engine:
@@ -44,6 +49,21 @@ def engine_of(running: Running) -> Engine:
             raise EngineError(f"--scheduler needs: pip install 'autoalign[cluster]' ({error})") from None
         return DaskEngine(scheduler=running.scheduler, limits=limits)
     return LocalEngine(workers=running.workers, limits=limits)
+
+
+def for_running(jobs: Sequence[Job], running: Running) -> list[Job]:
+    """The jobs as they are to be run. Raises ValueError for a URL that nothing can be put below."""
+    if running.upload:
+        check_upload(running.upload)
+        jobs = [replace(job, upload=running.upload) for job in jobs]
+    return [rooted(job) for job in jobs] if running.scheduler else list(jobs)
+
+
+def upload_reports(reports: Iterable[Path], running: Running) -> None:
+    """Put the reports where the results are put as well, if anywhere. Raises ImageWriteError."""
+    if running.upload:
+        for report in reports:
+            upload(report, running.upload, report.name)
 
 
 def make_folder(folder: Path) -> None:

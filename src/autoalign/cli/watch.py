@@ -15,13 +15,13 @@ from cyclopts import Parameter
 
 from autoalign.batch.arrivals import Arrivals, hints
 from autoalign.batch.engine import Engine
-from autoalign.batch.jobs import Job, JobOptions, Recorded, rooted
+from autoalign.batch.jobs import Job, JobOptions, Recorded
 from autoalign.batch.ledger import Ledger
 from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
 from autoalign.batch.sources import Selection, onto_reference
 from autoalign.batch.telling import write_reports
 from autoalign.cli.progress import tally
-from autoalign.cli.running import RUNNING, Running, engine_of, in_words, make_folder
+from autoalign.cli.running import RUNNING, Running, engine_of, for_running, in_words, make_folder, upload_reports
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, complain, note, tell
 from autoalign.errors import ImageReadError, ImageWriteError
 from autoalign.files.read import ReadOptions, read_picture
@@ -72,7 +72,8 @@ def watch(
     make_folder(files.out_dir)
     wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
     about = {"watched": str(folder)} | in_words(files, selection, drawing, reading, running, options)
-    engine, counts = engine_of(running), Counter[str]()
+    for_running([], running)  # nor should a URL that is none
+    engine, counts, reports = engine_of(running), Counter[str](), list[Path]()
     with (
         Ledger(files.out_dir) as ledger,
         feature_store(files.out_dir, running.cache) as store,
@@ -82,10 +83,10 @@ def watch(
         note(f"watching {folder}; Ctrl-C ends it", common)
         for names in _arriving(folder, selection, files):
             jobs = onto_reference(folder, names, files.reference, files.out_dir, wanted)
-            if running.scheduler:
-                jobs = [rooted(job) for job in jobs]
+            jobs = for_running(jobs, running)
             counts.update(_align(jobs, files, ledger, engine, store, common))
-            write_reports(files.out_dir, ledger, about)
+            reports = write_reports(files.out_dir, ledger, about)
+    upload_reports(reports, running)
     tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing new arrived")
     return Exit.DONE if set(counts) <= {"aligned"} else Exit.NOT_ALIGNED
 

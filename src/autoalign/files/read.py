@@ -58,14 +58,19 @@ def read_picture(path: str | Path, options: ReadOptions = ReadOptions(), *, page
     """
     path = Path(path)
     with opened(path) as file:
-        format = _format(file.read(HEAD_BYTES), path)
-        most = int(MAX_BYTES_PER_PIXEL * (options.max_pixels or MAX_PIXELS)) + MAX_METADATA
-        if file.seek(0, SEEK_END) > most:
-            size = f"{most / 1e9:,.1f} GB"
-            raise ImageReadError(f"is larger than the {size} that a picture as large as allowed takes: {path}")
+        _format(file.read(HEAD_BYTES), path, str(path))  # before all of it is read
+        check_length(file.seek(0, SEEK_END), options, str(path))
         file.seek(0)
         data = file.read()
-    header, pixels, remark = _decoded(data, format, page, options, path)
+    return decode_picture(data, path, str(path), options, page=page)
+
+
+def decode_picture(
+    data: bytes, path: Path, address: str, options: ReadOptions = ReadOptions(), *, page: int = 0
+) -> LoadedPicture:
+    """As `read_picture`, of bytes from a file that `path` names; errors end with `address`, which says where it is."""
+    format = _format(data[:HEAD_BYTES], path, address)
+    header, pixels, remark = _decoded(data, format, page, options, address)
     return LoadedPicture(
         pixels=pixels,
         metadata=describing(turned(header.metadata, header.orientation), pixels),
@@ -74,6 +79,14 @@ def read_picture(path: str | Path, options: ReadOptions = ReadOptions(), *, page
         path=path,
         remark=remark,
     )
+
+
+def check_length(length: int, options: ReadOptions, address: str) -> None:
+    """Raise ImageReadError, `address` last, for more bytes than a picture as large as allowed can have."""
+    most = int(MAX_BYTES_PER_PIXEL * (options.max_pixels or MAX_PIXELS)) + MAX_METADATA
+    if length > most:
+        size = f"{most / 1e9:,.1f} GB"
+        raise ImageReadError(f"is larger than the {size} that a picture as large as allowed takes: {address}")
 
 
 def read_text(path: Path, *, max_bytes: int) -> str:
@@ -121,17 +134,17 @@ def opened(path: Path) -> Iterator[BinaryIO]:
         raise ImageReadError(f"cannot be read ({one_line(error)}): {path}") from error
 
 
-def _format(head: bytes, path: Path) -> Format:
+def _format(head: bytes, path: Path, address: str) -> Format:
     if not head:
-        raise ImageReadError(f"is empty: {path}")
+        raise ImageReadError(f"is empty: {address}")
     try:
         return of_bytes(head, path)
     except Refused as refusal:
-        raise ImageReadError(f"{refusal}: {path}") from None
+        raise ImageReadError(f"{refusal}: {address}") from None
 
 
 def _decoded(
-    data: bytes, format: Format, page: int, options: ReadOptions, path: Path
+    data: bytes, format: Format, page: int, options: ReadOptions, address: str
 ) -> tuple[Header, Picture, str | None]:
     """The header, the upright pixels and a remark; whatever a decoder raises as an ImageReadError."""
     max_pixels = options.max_pixels or MAX_PIXELS
@@ -146,9 +159,10 @@ def _decoded(
             remark = f"is damaged ({one_line(error)}), and what could be read of it was taken"
             return *_decoded_by(decoder_for(format, page, lenient=True), data, max_pixels), remark
     except Refused as refusal:
-        raise ImageReadError(f"{refusal}: {path}") from refusal
+        raise ImageReadError(f"{refusal}: {address}") from refusal
     except Exception as error:
-        raise ImageReadError(f"is damaged, or no {format.name} that can be read ({one_line(error)}): {path}") from error
+        reason = f"is damaged, or no {format.name} that can be read ({one_line(error)})"
+        raise ImageReadError(f"{reason}: {address}") from error
 
 
 def _decoded_by(decoder: Decoder, data: bytes, max_pixels: float) -> tuple[Header, Picture]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from autoalign.errors import ImageReadError
-from autoalign.files.read import LoadedPicture, ReadOptions, read_picture
+from autoalign.files.read import LoadedPicture, read_picture
 from autoalign.geometry.homography import Mask
 from autoalign.picture.pixels import PixelSource, grey, size_of
 
@@ -19,17 +19,8 @@ class LoadedMask:
     sha256: str  # of the file's bytes
 
 
-def read_sized(
-    path: Path, size: tuple[int, int], options: ReadOptions = ReadOptions(), *, page: int = 0
-) -> LoadedPicture:
-    """Read a picture that must be of `size` (w, h). Raises ImageReadError, the path last."""
-    loaded = read_picture(path, options, page=page)
-    check_sized(loaded.pixels, size, path)
-    return loaded
-
-
-def check_sized(pixels: PixelSource, size: tuple[int, int], path: Path) -> None:
-    """Raise ImageReadError, the path last, unless the pixels of a file are of `size` (w, h)."""
+def check_sized(pixels: PixelSource, size: tuple[int, int], path: Path | str) -> None:
+    """Raise ImageReadError, the path or URL last, unless the pixels of a file are of `size` (w, h)."""
     (w, h), (wanted_w, wanted_h) = size_of(pixels), size
     if (w, h) != size:
         raise ImageReadError(f"is {w} x {h}, and a picture of {wanted_w} x {wanted_h} is needed: {path}")
@@ -40,5 +31,10 @@ def read_mask(path: Path, size: tuple[int, int]) -> LoadedMask:
 
     Raises ImageReadError, the path last.
     """
-    loaded = read_sized(path, size)
+    return as_mask(read_picture(path), size, path)
+
+
+def as_mask(loaded: LoadedPicture, size: tuple[int, int], path: Path | str) -> LoadedMask:
+    """As `read_mask`, of a picture that was read already."""
+    check_sized(loaded.pixels, size, path)
     return LoadedMask(valid=grey(loaded.pixels) == 0, sha256=loaded.sha256)
