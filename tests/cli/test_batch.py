@@ -96,6 +96,29 @@ def test_what_cannot_be_done_is_said_in_one_line(shots, run, words, code, messag
     assert message in outcome.err
 
 
+def test_pictures_by_url_and_results_to_one(shots, run, server):
+    for name in ("fixed.jpg", "moving.jpg"):
+        server.files[f"/{name}"] = (shots / "in" / name).read_bytes()
+    (shots / "list.csv").write_text(f"fixed,moving\n{server.url}/fixed.jpg,{server.url}/moving.jpg?sig=secret\n")
+    words = ("batch", "list.csv", "--out-dir", "out", "--upload", f"file://{shots}/up", "--workers", "1")
+    plan = run(*words, "--plan")
+    assert plan.out.startswith(f"{server.url}/moving.jpg -> {server.url}/fixed.jpg: out/moving.jpg\n")
+    assert run(*words).code == 0
+    for name in ("moving.jpg", "moving.jpg.autoalign.json", "report.html", "batch.rrd"):
+        assert (shots / "up" / name).read_bytes() == (shots / "out" / name).read_bytes()
+    assert "1 of them done before" in run(*words).out
+
+
+@pytest.mark.parametrize("words", [("batch", "in"), ("watch", "in", "--until-idle", "0.1")])
+@pytest.mark.parametrize(("url", "message"), [("https://h/up", "not https"), ("s3://b?key=secret", "has a # or ?")])
+def test_where_nothing_can_be_uploaded(shots, run, words, url, message):
+    outcome = run(*words, "--reference", "in/fixed.jpg", "--out-dir", "out", "--upload", url)
+    assert (outcome.code, outcome.err.count("\n")) == (2, 1)
+    assert message in outcome.err
+    assert "secret" not in outcome.err
+    assert not (shots / "out").exists()
+
+
 def test_a_folder_for_results_that_cannot_be(shots, run):
     (shots / "out").write_text("a file")
     outcome = run("batch", "in", "--reference", "in/fixed.jpg", "--out-dir", "out")
@@ -105,13 +128,14 @@ def test_a_folder_for_results_that_cannot_be(shots, run):
 
 def test_watching_until_nothing_comes(shots, run):
     words = ("--reference", "in/fixed.jpg", "--out-dir", "out", "--until-idle", "0.1", "--workers", "1")
-    first = run("watch", "in", *words)
+    first = run("watch", "in", *words, "--upload", f"file://{shots}/up")
     assert first.code == 1
     assert "aligned moving.jpg:" in first.out
     assert "failed torn.jpg: is damaged" in first.out
     assert first.out.endswith("2 pairs: 1 aligned, 1 failed\n")
-    assert (shots / "out" / "report.html").exists()
-    second = run("watch", "in", *words)
+    assert (shots / "out" / "report.html").read_bytes() == (shots / "up" / "report.html").read_bytes()
+    assert (shots / "out" / "moving.jpg").read_bytes() == (shots / "up" / "moving.jpg").read_bytes()
+    second = run("watch", "in", *words, "--upload", f"file://{shots}/up")
     assert (second.code, second.out) == (0, "nothing new arrived\n")
     assert run("watch", "nowhere", *words).code == run("watch", "in", *("--reference", "x.png", *words[2:])).code == 3
 

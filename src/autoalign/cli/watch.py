@@ -25,6 +25,7 @@ from autoalign.cli.running import RUNNING, Running, engine_of, for_running, in_w
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, complain, note, tell
 from autoalign.errors import ImageReadError, ImageWriteError
 from autoalign.files.read import ReadOptions, read_picture
+from autoalign.files.remote import check_upload
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
 
@@ -69,10 +70,11 @@ def watch(
     if not folder.is_dir():
         raise ImageReadError(f"is no folder: {folder}")
     read_picture(files.reference, reading)  # a reference that is no good should not be found out at night
+    if running.upload:
+        check_upload(running.upload)  # nor should a URL that is none
     make_folder(files.out_dir)
     wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
     about = {"watched": str(folder)} | in_words(files, selection, drawing, reading, running, options)
-    for_running([], running)  # nor should a URL that is none
     engine, counts, reports = engine_of(running), Counter[str](), list[Path]()
     with (
         Ledger(files.out_dir) as ledger,

@@ -7,6 +7,7 @@ What is secret in a URL, as a signature in its query, goes to its server only: p
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -168,15 +169,18 @@ def _place(url: str) -> tuple[ObjectStore, str]:
 @lru_cache
 def _bucket(url: str) -> ObjectStore:
     """Kept, with its connections and with the credentials that it may have had to ask for."""
-    store: ObjectStore = _package().from_url(url, **_terms())
+    # Of the environment, obstore forgets this one thing once it is told how long to wait; stores at home need it.
+    allow_http = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
+    store: ObjectStore = _package().from_url(url, **_terms(allow_http=allow_http))
     return store
 
 
-def _terms(**more: bool) -> dict[str, Any]:
+def _terms(*, allow_http: bool) -> dict[str, Any]:
     """How long a server is waited for, and how often it is asked again."""
-    limits = {"connect_timeout": CONNECT_S, "read_timeout": STALLED_S, "timeout": WHOLE_S}
+    patience = {"connect_timeout": CONNECT_S, "read_timeout": STALLED_S, "timeout": WHOLE_S}
     return {
-        "client_options": {name: timedelta(seconds=seconds) for name, seconds in limits.items()} | more,
+        "client_options": {"allow_http": allow_http}
+        | {name: timedelta(seconds=seconds) for name, seconds in patience.items()},
         "retry_config": {"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRYING_S)},
     }
 
@@ -225,4 +229,4 @@ def _reason(error: Exception) -> str:
         return f"the server says {status[1].strip()}"
     if said := re.search(r'message: "([^"]*)"', text):  # by the operating system, such as: Connection refused
         return said[1]
-    return re.sub(r"\S+://\S+", "...", text.partition("\n")[0])[:MAX_REASON]
+    return re.sub(r"\S+://\S+", "...", text.partition("\n")[0]).rpartition(" - ")[2][:MAX_REASON]
