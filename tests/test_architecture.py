@@ -84,7 +84,20 @@ FLOORS: tuple[dict[str, tuple[str, ...]], ...] = (
             "export",
         )
     },
-    {"views": ("motion", "tally", "words", "evidence", "pictures", "charts", "report", "viewer", "viewer_batch", "window")},
+    {
+        "views": (
+            "motion",
+            "tally",
+            "words",
+            "evidence",
+            "pictures",
+            "charts",
+            "report",
+            "viewer",
+            "viewer_batch",
+            "window",
+        )
+    },
     {
         "batch": (
             "jobs",

@@ -90,6 +90,21 @@ def test_only_what_changed_or_is_gone_or_failed_is_done_again(folder, tmp_path):
         assert ledger.pending() == []
 
 
+def test_pictures_that_are_away_cost_no_earlier_result(folder, tmp_path):
+    out = tmp_path / "out"
+    jobs = jobs_of(folder, out)
+    run(jobs, out)
+    before, source = contents(out), folder / "frame2.png"
+    away = source.rename(tmp_path / "away.png")
+    (row,) = run(jobs, out)
+    assert (row.name, row.status, row.output) == ("frame2.png", "failed", None)
+    assert row.advice == "the result of an earlier run was left as it is"
+    assert contents(out) == before
+    away.rename(source)
+    assert [(row.name, row.status) for row in run(jobs, out)] == [("frame2.png", "aligned")]
+    assert contents(out) == before
+
+
 def test_fail_fast_leaves_the_rest_for_another_time(folder, tmp_path):
     out = tmp_path / "out"
     assert [row.name for row in run(jobs_of(folder, out), out, fail_fast=True)] == ["damaged.png"]

@@ -70,7 +70,9 @@ def do_task(task: Task) -> Done:
         found = _find(job, fixed, moving)
         written = _write(job, found, fixed.loaded, moving.loaded)
         _upload(job, written)
-    except (ImageReadError, ImageWriteError, CanvasError, ValueError) as error:
+    except ImageReadError as error:
+        return Done(row=_unread_row(job, str(error)))
+    except (ImageWriteError, CanvasError, ValueError) as error:
         return Done(row=failed_row(job, str(error)))
     transform = None if found.kept.fixed_from_moving is None else transform_of(found.kept)
     small = thumbnails(fixed.loaded.pixels, moving.loaded.pixels, transform)
@@ -78,10 +80,23 @@ def do_task(task: Task) -> Done:
 
 
 def failed_row(job: Job, reason: str) -> Row:
-    """The row of a job that could not be tried or finished; nothing of an earlier run may pass for its result."""
+    """The row of a job that could not be finished; nothing of an earlier run may pass for its result."""
     for path in job.outputs:
         path.unlink(missing_ok=True)
-    return Row(name=job.name, fixed=shown(job.fixed), moving=shown(job.moving), status="failed", reason=reason)
+    return _without_result(job, reason)
+
+
+def _unread_row(job: Job, reason: str) -> Row:
+    """The row of a job whose pictures cannot be read. What an earlier run made of them stays: they may be gone for
+    good, or behind a disk or a server that is away for now."""
+    kept = any(path.exists() for path in job.outputs)
+    return _without_result(job, reason, advice="the result of an earlier run was left as it is" if kept else "")
+
+
+def _without_result(job: Job, reason: str, advice: str = "") -> Row:
+    return Row(
+        name=job.name, fixed=shown(job.fixed), moving=shown(job.moving), status="failed", reason=reason, advice=advice
+    )
 
 
 @cache
