@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -54,22 +54,20 @@ class Job:
     placed: SequenceFrame | None = None  # where a whole sequence puts it; None where that is to be found out
     upload: str | None = None  # URL below which its files are put as well
 
-    @cached_property
+    @property
     def output(self) -> Path:
         """The aligned picture: the moving one's name and format, or a format that can be written behind its name."""
-        extension = os.path.splitext(self.name)[1]
-        written = _written_extension(extension, self.options.drawing.border)
-        return self._below("" if written == extension else written)
+        return Path(self._written[0])
 
-    @cached_property
+    @property
     def sidecar(self) -> Path:
         """With the whole name, because a camera writes IMG_1.CR2 and IMG_1.JPG into one folder."""
-        return self._below(".autoalign.json")
+        return Path(self._written[1])
 
-    @cached_property
+    @property
     def recording(self) -> Path:
         """For the viewer, if it is wanted."""
-        return self._below(".autoalign.rrd")
+        return Path(self._written[2])
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -84,17 +82,23 @@ class Job:
     @property
     def places(self) -> Iterator[str]:
         """The `place` of all that it may write or upload."""
-        for path in self.outputs:
-            yield place(str(path))
+        for path in self._written:
+            yield place(path)
             if self.upload:
-                yield place(below(self.upload, self.within(path)))
+                yield place(below(self.upload, self.within(Path(path))))
 
     def within(self, output: Path) -> str:
         """The name of one of its outputs in the batch's folder, with slashes."""
         return output.relative_to(self.out_dir).as_posix()
 
-    def _below(self, ending: str) -> Path:
-        return Path(self.out_dir, self.name + ending)
+    @property
+    def _written(self) -> tuple[str, str, str]:
+        """The outputs as text, without what paths cost where there are a hundred thousand."""
+        extension = os.path.splitext(self.name)[1]
+        written = _written_extension(extension, self.options.drawing.border)
+        endings = "" if written == extension else written, ".autoalign.json", ".autoalign.rrd"
+        picture, sidecar, recording = (os.path.join(self.out_dir, self.name + ending) for ending in endings)
+        return picture, sidecar, recording
 
 
 @lru_cache

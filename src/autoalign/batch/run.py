@@ -104,7 +104,7 @@ def planned(
     mine = {job.name for job in jobs}
     rows = [row for row in ledger.rows() if row.name in mine]
     ledger.reopen(row.name for row in rows if _is_gone(row, out_dir) or (options.retry and row.status == "failed"))
-    _sweep({os.path.dirname(job.output) for job in jobs})
+    _sweep({os.path.dirname(os.path.join(job.out_dir, job.name)) for job in jobs})
     uses = Counter(path for job in jobs for path in job.inputs)
     again = options.again or frozenset(path for path, count in uses.items() if count > 1)
     tasks = tuple(
@@ -154,7 +154,7 @@ def _is_gone(row: Row, out_dir: Path) -> bool:
 def _check_strangers(jobs: Iterable[Job], known: set[str]) -> None:
     """Raise ImageWriteError, the path last, for a file in the way of a job that the ledger has never heard of."""
     for job in jobs:
-        for path in job.outputs if job.name not in known else ():
+        for path in job.places if job.name not in known else ():
             if os.path.exists(path):
                 raise ImageWriteError(f"exists already, and is no result of this batch: {path}")
 
