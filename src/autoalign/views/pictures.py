@@ -19,7 +19,7 @@ from autoalign.picture.pixels import Picture, has_alpha, in_colour, opaque, shri
 from autoalign.picture.warp import warp
 
 MAX_SIDE = 8192  # px; the textures of many a graphics card and of every browser end here
-LAYER_PIXELS = 1.6e6  # of the pictures of both in one frame: more than a screen shows of them; some 300 kB each
+LAYER_PIXELS = 1e6  # of the pictures of both in one frame, which share a screen with others; some 200 kB each
 QUALITY = 80  # of JPEGs made here: no artefact that could be taken for a misalignment
 THUMBNAIL_SIDE = 160  # px, of the longer one
 THUMBNAIL_QUALITY = 70  # of JPEGs that stand by the thousand in one file
