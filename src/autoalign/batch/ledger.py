@@ -34,6 +34,7 @@ from autoalign.batch.schema import (
 )
 from autoalign.errors import AutoalignError, ImageReadError, ImageWriteError
 from autoalign.files.codec import one_line
+from autoalign.files.read import state_of
 from autoalign.files.remote import hash_of as hash_of_url
 from autoalign.files.remote import is_url
 from autoalign.files.row import ROW_STATUSES, Row, RowStatus, Thumbnails
@@ -268,13 +269,13 @@ class Ledger(LedgerReader):
             return hash_of_url(str(path))
         path = os.path.abspath(path)
         try:
-            state = _state(path)
+            state = state_of(path)
             sql = f"SELECT sha256 FROM file WHERE path = {TEXT} AND (size, mtime_ns, inode) = (?, ?, ?)"
             for (known,) in self._found(sql, bound(path), *state):
                 return str(known)
             with open(path, "rb") as file:
                 sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-            if state == _state(path) and time.time_ns() - state[1] > SETTLED_NS:
+            if state == state_of(path) and time.time_ns() - state[1] > SETTLED_NS:
                 self._remember(path, state, sha256)
         except OSError as error:
             raise ImageReadError(f"cannot be read ({one_line(error)}): {path}") from error
@@ -341,12 +342,6 @@ def _file_system(path: Path) -> str:
     # The longest is the innermost; of two at one place, the later one hides the other.
     innermost = max(enumerate(mounts), key=lambda place: (len(place[1].mountpoint), place[0]), default=None)
     return "" if innermost is None else innermost[1].fstype.lower()
-
-
-def _state(path: str) -> tuple[int, int, int]:
-    """Size, time of the last change in ns, and inode: what would be another if the content were."""
-    found = os.stat(path)
-    return found.st_size, found.st_mtime_ns, found.st_ino
 
 
 def _numbered(entries: Iterable[Entry], first: int) -> Iterator[tuple[Any, ...]]:

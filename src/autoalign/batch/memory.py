@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 
 from autoalign.files.feature_store import recall_from
-from autoalign.files.read import LoadedPicture, ReadOptions, read_picture
+from autoalign.files.read import LoadedPicture, ReadOptions, read_picture, state_of
 from autoalign.files.remote import is_url, read_url, shown, version_of
 from autoalign.files.sized import as_mask
 from autoalign.picture.pixels import size_of
@@ -80,7 +79,6 @@ def _stamp(path: str) -> object:
     if is_url(path):
         return version_of(path) or object()  # which equals no other: what cannot be told apart is fetched again
     try:
-        found = os.stat(path)
+        return state_of(path)
     except (OSError, ValueError):
         return None
-    return found.st_size, found.st_mtime_ns, found.st_ino

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from autoalign.cli.terminal import STYLE_OF, tell
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 LINE_EVERY_S = 10.0  # where there is no terminal
 
 
-class Follow(Protocol):
-    """Takes the status of one thing after the other."""
-
-    def __call__(self, status: str) -> None: ...
+Follow = Callable[[str], None]
+"""Takes the status of one thing after the other."""
 
 
 @contextmanager
@@ -64,14 +65,13 @@ class _Lines:
 
 
 @contextmanager
-def _live(what: str, total: int, console: object) -> Iterator[Follow]:
+def _live(what: str, total: int, console: Console) -> Iterator[Follow]:
     """A bar that fits 80 columns, with the counts in the colours of the verdicts below it."""
-    from rich.console import Console, Group
+    from rich.console import Group
     from rich.live import Live
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.text import Text
 
-    assert isinstance(console, Console)
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),

@@ -6,11 +6,11 @@ The extension is not believed, the first bytes are.
 from __future__ import annotations
 
 import hashlib
+import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from os import SEEK_END
 from pathlib import Path
 from typing import BinaryIO
 
@@ -59,7 +59,7 @@ def read_picture(path: str | Path, options: ReadOptions = ReadOptions(), *, page
     path = Path(path)
     with opened(path) as file:
         _format(file.read(HEAD_BYTES), path, str(path))  # before all of it is read
-        check_length(file.seek(0, SEEK_END), options, str(path))
+        check_length(file.seek(0, os.SEEK_END), options, str(path))
         file.seek(0)
         data = file.read()
     return decode_picture(data, path, str(path), options, page=page)
@@ -113,6 +113,12 @@ def upright(pixels: Picture, orientation: int) -> Picture:
     rows_reversed = orientation in (3, 4, 7, 8)
     columns_reversed = orientation in (2, 3, 6, 7)
     return np.ascontiguousarray(pixels[:: -1 if rows_reversed else 1, :: -1 if columns_reversed else 1])
+
+
+def state_of(path: str | Path) -> tuple[int, int, int]:
+    """Size, time of the last change in ns, and inode: what would be another if the content were. Raises OSError."""
+    found = os.stat(path)
+    return found.st_size, found.st_mtime_ns, found.st_ino
 
 
 @contextmanager
