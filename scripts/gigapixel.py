@@ -23,11 +23,10 @@ import cv2
 import numpy as np
 import tifffile
 
-from autoalign.files.large import LargeDrawing, opened_picture, write_large
-from autoalign.files.metadata import Metadata
+from autoalign.files.large import opened_picture
+from autoalign.files.result import Placed, ResultFiles, write_placed
 from autoalign.files.sidecar import read_sidecar, transform_of
 from autoalign.geometry.homography import project
-from autoalign.picture.canvas import Canvas
 from autoalign.picture.warp import warp
 from autoalign.registration.drawing import Drawing
 
@@ -133,21 +132,16 @@ def run_pair(folder: Path) -> tuple[float, float]:
 
 def speeds(folder: Path, fixed_from_moving: np.ndarray, size: tuple[int, int]) -> dict[str, float]:
     """MP/s of drawing the moving picture, of output."""
-    frame = Canvas(size=size, canvas_from_fixed=np.eye(3))
     found = {}
     with opened_picture(folder / "moving.tif") as moving:
-        what = LargeDrawing(
-            pixels=moving.pixels, frame=frame, fixed_from_moving=fixed_from_moving, drawing=Drawing(canvas="fixed")
-        )
+        what = Placed(picture=moving, fixed_size=size, fixed_from_moving=fixed_from_moving, drawing=Drawing())
         side = min(IN_MEMORY, *size)
         part = moving.pixels[slice(0, side), slice(0, side)]
         found["in memory"] = _rate((side, side), lambda: warp(part, (side, side), fixed_from_moving))
-        found["from the file"] = _rate(size, lambda: [None for _ in what.strips(lambda strips, _: strips)])
-        drawn = folder / "drawn.tif"
-        found["from the file to a file"] = _rate(
-            size, lambda: write_large(drawn, what, Metadata(), lambda strips, _: strips)
-        )
-        drawn.unlink()
+        found["from the file"] = _rate(size, lambda: [None for _ in what.strips()])
+        files = ResultFiles(aligned=folder / "drawn.tif")
+        found["from the file to a file"] = _rate(size, lambda: write_placed(files, what, None, in_strips=True))
+        files.aligned.unlink()
     return found
 
 

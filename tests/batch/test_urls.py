@@ -12,10 +12,11 @@ from autoalign.batch.engine import InlineEngine
 from autoalign.batch.jobs import Job, JobOptions
 from autoalign.batch.ledger import Ledger, LedgerReader
 from autoalign.batch.manifest import manifest_jobs
-from autoalign.batch.memory import PictureMemory, Source
+from autoalign.batch.memory import PictureMemory
 from autoalign.batch.run import PlanOptions, align_batch, by_key, carry_out, feature_store, planned
 from autoalign.batch.telling import write_reports
 from autoalign.errors import ImageReadError
+from autoalign.files.ready import Source
 from autoalign.files.row import Row
 
 SECRET = "wJalrXUtnFEMI"  # as in conftest.py
@@ -91,14 +92,19 @@ def test_only_what_has_changed_is_done_again(server, rows, folder, tmp_path):
 def test_a_worker_fetches_again_what_it_cannot_tell_to_be_the_same(server, folder):
     server.files["/a.png"] = (folder / "frame1.png").read_bytes()
     memory, source = PictureMemory(), Source(path=f"{server.url}/a.png")
-    assert memory.ready(source) is memory.ready(source)
+
+    def opened():
+        with memory.opened(source) as ready:
+            return ready
+
+    assert opened() is opened()
     server.files["/a.png"] = (folder / "frame2.png").read_bytes()
-    assert memory.ready(source).loaded.sha256 == aa.read_picture(folder / "frame2.png").sha256
+    assert opened().picture.sha256 == aa.read_picture(folder / "frame2.png").sha256
     server.manners["/a.png"] = "untagged"
-    assert memory.ready(source) is not memory.ready(source)
+    assert opened() is not opened()
     del server.files["/a.png"]
     with pytest.raises(ImageReadError, match="does not exist"):
-        memory.ready(source)
+        opened()
 
 
 def test_results_are_put_into_a_bucket_and_what_could_not_be_is_tried_again(server, rows, tmp_path):

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import autoalign as aa
-from autoalign.batch import memory
 from autoalign.batch.jobs import Job, JobOptions, key
-from autoalign.batch.memory import PictureMemory, Source
+from autoalign.batch.memory import PictureMemory
 from autoalign.batch.work import Task, do_task
 from autoalign.errors import ImageReadError
+from autoalign.files import large
 from autoalign.files.feature_store import recall_from
+from autoalign.files.ready import Ready, Source
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.features import FeatureOptions, detect
 from autoalign.registration.prepared import prepare
@@ -94,24 +95,38 @@ def test_cameras_that_write_two_files_under_one_stem(job):
     assert raw.sidecar != jpeg.sidecar
 
 
+def opened(memory: PictureMemory, path: str) -> Ready:
+    with memory.opened(Source(path=path)) as ready:
+        return ready
+
+
 def test_a_picture_is_read_once_until_it_changes_or_there_is_no_room(folder, monkeypatch):
     read = []
-    monkeypatch.setattr(memory, "read_picture", lambda path, *args, **named: read.append(path) or aa.read_picture(path))
+    monkeypatch.setattr(large, "read_picture", lambda path, *args, **named: read.append(path) or aa.read_picture(path))
     one, two = str(folder / "frame1.png"), str(folder / "frame2.png")
     roomy = PictureMemory()
-    assert roomy.ready(Source(path=one)) is roomy.ready(Source(path=one))
-    roomy.ready(Source(path=two))
-    roomy.ready(Source(path=one))
+    assert opened(roomy, one) is opened(roomy, one)
+    opened(roomy, two)
+    opened(roomy, one)
     assert read == [one, two]
     (folder / "frame1.png").write_bytes((folder / "frame10.png").read_bytes())
-    roomy.ready(Source(path=one))
+    opened(roomy, one)
     assert read == [one, two, one]
     tight = PictureMemory(max_bytes=1)
     for path in (one, two, one):
-        tight.ready(Source(path=path))
+        opened(tight, path)
     assert read == [one, two, one, one, two, one]
     with pytest.raises(ImageReadError, match="does not exist"):
-        roomy.ready(Source(path=str(folder / "nowhere.png")))
+        opened(roomy, str(folder / "nowhere.png"))
+
+
+def test_of_a_pair_the_fixed_picture_is_kept_longer(folder):
+    one, two = str(folder / "frame1.png"), str(folder / "frame2.png")
+    tight = PictureMemory(max_bytes=1)
+    with tight.opened(Source(path=one)) as fixed, tight.opened(Source(path=two)) as moving:
+        assert fixed is not moving
+    assert opened(tight, one) is fixed
+    assert opened(tight, two) is not moving
 
 
 def test_features_are_kept_on_disk_and_found_again(folder, tmp_path):

@@ -163,19 +163,19 @@ def test_masks_are_white_where_to_ignore(pictures, run):
     aa.write_picture("mask.png", mask)
     seen = {}
 
-    def align(fixed, moving, options, *, fixed_valid, moving_valid):
-        seen.update(fixed=fixed_valid, moving=moving_valid)
+    def align(both, options):
+        seen.update(zip(("fixed", "moving"), (of.prepared.usable for of in both.seen()), strict=True))
         raise ValueError("seen enough")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pair_module, "align", align)
+        patch.setattr(pair_module, "align_both", align)
         assert run("pair", "fixed.jpg", "moving.jpg", "--fixed-mask", "mask.png").code == 2
     assert np.array_equal(seen["fixed"], mask == 0)
     assert seen["moving"] is None
 
 
 def test_an_output_is_refused_before_any_work(pictures, run, monkeypatch):
-    monkeypatch.setattr(pair_module, "align", lambda *_, **__: pytest.fail("worked in vain"))
+    monkeypatch.setattr(pair_module, "align_both", lambda *_, **__: pytest.fail("worked in vain"))
     (pictures / "out.png").write_bytes(b"precious")
     assert run("pair", "fixed.jpg", "moving.jpg", "-o", "out.png").code == 3
     assert (pictures / "out.png").read_bytes() == b"precious"
@@ -189,14 +189,14 @@ def test_an_interrupt_leaves_nothing(pictures, run, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pair_module, "align", interrupted)
+    monkeypatch.setattr(pair_module, "align_both", interrupted)
     outcome = run("pair", "fixed.jpg", "moving.jpg")
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "autoalign: interrupted\n")
     assert names(pictures) == {"fixed.jpg", "moving.jpg"}
 
 
 def test_a_bug_is_called_one(pictures, run, monkeypatch):
-    monkeypatch.setattr(pair_module, "align", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(pair_module, "align_both", lambda *_, **__: 1 / 0)
     outcome = run("pair", "fixed.jpg", "moving.jpg")
     assert outcome.code == 70
     assert outcome.err == "autoalign: this is a bug (ZeroDivisionError: division by zero); -v shows where\n"

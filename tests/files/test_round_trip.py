@@ -22,6 +22,7 @@ from autoalign.cli.main import main
 from autoalign.files.formats import FORMATS, Format
 from autoalign.files.metadata import Metadata
 from autoalign.files.read import read_picture
+from autoalign.files.ready import Both, Ready, Source
 from autoalign.files.result import ResultFiles, write_result
 from autoalign.files.write import write_picture
 from autoalign.geometry.homography import translation
@@ -90,7 +91,8 @@ def test_what_came_in_comes_out(tmp_path: Path, make_picture: Any, format: Forma
     first, last = tmp_path / f"a{format.extensions[-1]}", tmp_path / f"b{format.extensions[0]}"
     write_picture(first, pixels, Metadata(icc=PROFILES[colours], exif=camera_exif(), xmp=XMP, dpi=(300, 240)))
     loaded = read_picture(first)
-    written = write_result(ResultFiles(aligned=last), loaded, loaded, translation(*SHIFT), Drawing())
+    ready = Ready(source=Source(path=str(first)), picture=loaded)
+    written = write_result(ResultFiles(aligned=last), Both(fixed=ready, moving=ready), translation(*SHIFT), Drawing())
     assert written == [last]
 
     expected = as_kept(pixels, format)[: -SHIFT[1], : -SHIFT[0]]

@@ -12,7 +12,7 @@ from autoalign.batch.jobs import Job, key, readable
 from autoalign.batch.ledger import Ledger
 from autoalign.batch.work import Task
 from autoalign.errors import ImageReadError
-from autoalign.registration.align import align
+from autoalign.files.ready import align_both
 from autoalign.registration.drawing import Drawing
 from autoalign.registration.sequence import Link, link_of, links, solve_sequence
 
@@ -87,8 +87,8 @@ def _task(frames: Sequence[Job], fixed: int, moving: int, ledger: Ledger, store:
 def _link(pair: _Pair) -> str:
     """Align two frames, and write nothing; frames that cannot be read are not linked."""
     try:
-        fixed, moving = pair.task.ready()
-        alignment = align(fixed.prepared, moving.prepared, pair.task.job.options.align)
+        with pair.task.opened() as both:
+            alignment = align_both(both, pair.task.job.options.align)
     except (ImageReadError, ValueError):
         return _as_text(_unlinked(pair))
     link = link_of(alignment, pair.fixed, pair.moving)

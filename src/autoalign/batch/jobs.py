@@ -15,6 +15,7 @@ import numpy as np
 
 from autoalign import __version__
 from autoalign.errors import ImageReadError
+from autoalign.files.formats import TIFF
 from autoalign.files.read import ReadOptions
 from autoalign.files.remote import below, is_url, path_of
 from autoalign.files.write import default_output
@@ -60,6 +61,11 @@ class Job:
         return Path(self._written[0])
 
     @property
+    def large_output(self) -> Path:
+        """The same where a picture is so large that the result can be written as TIFF only."""
+        return Path(self._written[3])
+
+    @property
     def sidecar(self) -> Path:
         """With the whole name, because a camera writes IMG_1.CR2 and IMG_1.JPG into one folder."""
         return Path(self._written[1])
@@ -75,14 +81,14 @@ class Job:
         return tuple(path for path in (self.fixed, self.moving, self.fixed_mask, self.moving_mask) if path)
 
     @property
-    def outputs(self) -> tuple[Path, Path, Path]:
+    def outputs(self) -> tuple[Path, ...]:
         """All that it may write."""
-        return self.output, self.sidecar, self.recording
+        return tuple(map(Path, self._written))
 
     @property
     def places(self) -> Iterator[str]:
         """The `place` of all that it may write or upload."""
-        for path in self._written:
+        for path in dict.fromkeys(self._written):
             yield place(path)
             if self.upload:
                 yield place(below(self.upload, self.within(Path(path))))
@@ -92,13 +98,15 @@ class Job:
         return output.relative_to(self.out_dir).as_posix()
 
     @property
-    def _written(self) -> tuple[str, str, str]:
+    def _written(self) -> tuple[str, str, str, str]:
         """The outputs as text, without what paths cost where there are a hundred thousand."""
         extension = os.path.splitext(self.name)[1]
         written = _written_extension(extension, self.options.drawing.border)
-        endings = "" if written == extension else written, ".autoalign.json", ".autoalign.rrd"
-        picture, sidecar, recording = (os.path.join(self.out_dir, self.name + ending) for ending in endings)
-        return picture, sidecar, recording
+        path = os.path.join(self.out_dir, self.name)
+        picture = path if written == extension else path + written
+        # Not .tif alone: beside IMG_1.jpg there may be a picture with the name IMG_1.jpg.tif.
+        large = picture if written.lower() in TIFF.extensions else f"{path}.autoalign{TIFF.extensions[0]}"
+        return picture, f"{path}.autoalign.json", f"{path}.autoalign.rrd", large
 
 
 @lru_cache

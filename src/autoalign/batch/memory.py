@@ -3,55 +3,40 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 
-from autoalign.files.feature_store import recall_from
-from autoalign.files.read import LoadedPicture, ReadOptions, read_picture, state_of
-from autoalign.files.remote import is_url, read_url, shown, version_of
-from autoalign.files.sized import as_mask
-from autoalign.picture.pixels import size_of
-from autoalign.registration.prepared import Prepared, prepare
+from autoalign.files.large import is_large
+from autoalign.files.read import state_of
+from autoalign.files.ready import Ready, Source, opened_source
+from autoalign.files.remote import is_url, version_of
 
 MAX_BYTES = 512 * 2**20
 
 
-@dataclass(frozen=True, kw_only=True)
-class Ready:
-    """A picture as its file has it, and as it is aligned."""
-
-    loaded: LoadedPicture
-    prepared: Prepared
-
-    @property
-    def nbytes(self) -> int:
-        return self.loaded.pixels.nbytes + self.prepared.nbytes
-
-
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """Where a picture is, and what of it is taken."""
-
-    path: str  # or a URL
-    mask: str | None = None  # a picture of the same size that is not black where this one is to be ignored
-    page: int = 0
-    reading: ReadOptions = ReadOptions()
-
-
 class PictureMemory:
-    """The pictures used last, within a bound; a file that was changed is read again."""
+    """The pictures used last, within a bound; a file that was changed is read again.
+
+    Of one that stays in its file the copy is kept, and the file opened anew.
+    """
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         self._max_bytes = max_bytes
         self._kept: OrderedDict[tuple[object, ...], Ready] = OrderedDict()
 
-    def ready(self, source: Source, store: str | None = None) -> Ready:
-        """The picture, its features kept in the folder `store` if one is given. Raises ImageReadError."""
-        stamp = (source, _stamp(source.path), source.mask and _stamp(source.mask), store)
-        found = self._kept.pop(stamp, None) or _read(source, store)
-        self._kept[stamp] = found
-        self._shrink()
-        return found
+    @contextmanager
+    def opened(self, source: Source) -> Iterator[Ready]:
+        """The picture, open to be read as long as the block lasts. Raises ImageReadError."""
+        stamp = (source, _stamp(source.path), source.mask and _stamp(source.mask))
+        with _opened(source, self._kept.get(stamp)) as ready:
+            self._kept[stamp] = ready
+            try:
+                yield ready
+            finally:
+                self._kept[stamp] = ready
+                self._kept.move_to_end(stamp)  # the one let go last, which of a pair is the fixed one, stays longest
+                self._shrink()
 
     def _shrink(self) -> None:
         """Forget what was not used for longest; the last one stays, whatever its size."""
@@ -61,17 +46,14 @@ class PictureMemory:
             total -= oldest.nbytes
 
 
-def _read(source: Source, store: str | None) -> Ready:
-    loaded = _loaded(source.path, source.reading, source.page)
-    hidden = as_mask(_loaded(source.mask), size_of(loaded.pixels), shown(source.mask)) if source.mask else None
-    identity = f"{loaded.sha256} {source.page} {source.reading.lenient} {hidden.sha256 if hidden else ''}"
-    valid = hidden.valid if hidden else None
-    recall = recall_from(Path(store), identity) if store else None
-    return Ready(loaded=loaded, prepared=prepare(loaded.pixels, valid, recall=recall))
-
-
-def _loaded(path: str, reading: ReadOptions = ReadOptions(), page: int = 0) -> LoadedPicture:
-    return (read_url if is_url(path) else read_picture)(path, reading, page=page)
+@contextmanager
+def _opened(source: Source, kept: Ready | None) -> Iterator[Ready]:
+    if kept is not None and not is_large(kept.picture):
+        yield kept
+        return
+    with opened_source(source) as ready:
+        known = kept is not None and kept.picture.sha256 == ready.picture.sha256
+        yield replace(kept, picture=ready.picture) if kept is not None and known else ready
 
 
 def _stamp(path: str) -> object:

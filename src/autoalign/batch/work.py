@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
 from autoalign.batch.jobs import Job
-from autoalign.batch.memory import PictureMemory, Ready, Source
+from autoalign.batch.memory import PictureMemory
 from autoalign.errors import CanvasError, ImageReadError, ImageWriteError
-from autoalign.files.read import LoadedPicture
+from autoalign.files.ready import Both, Source, align_both
 from autoalign.files.record import placed_record, record
 from autoalign.files.remote import shown, upload
-from autoalign.files.result import ResultFiles, write_result
+from autoalign.files.result import ResultFiles, check_in_strips, write_result
 from autoalign.files.row import Row, Thumbnails
 from autoalign.files.sidecar import Sidecar, transform_of, write_sidecar
 from autoalign.files.write import write_bytes_atomically
-from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment
 from autoalign.views.pictures import thumbnails
+
+NO_RECORDING = "autoalign pair --overlay: there is no recording of pictures of so many pixels"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,15 +33,18 @@ class Task:
     store: str | None = None  # folder where the features of the pictures in `again` are kept
     again: frozenset[str] = frozenset()  # the inputs that come again in other jobs
 
-    def ready(self) -> tuple[Ready, Ready]:
-        """The fixed and the moving picture, from the memory of this process if it has them; ImageReadError if not."""
-        job, options = self.job, self.job.options
-        fixed = Source(path=job.fixed, mask=job.fixed_mask, page=options.fixed_page, reading=options.reading)
-        moving = Source(path=job.moving, mask=job.moving_mask, page=options.moving_page, reading=options.reading)
-        return self._ready(fixed), self._ready(moving)
+    @contextmanager
+    def opened(self) -> Iterator[Both]:
+        """Both pictures, from the memory of this process if it has them. Raises ImageReadError."""
+        job, memory = self.job, _memory()
+        fixed = self._source(job.fixed, job.fixed_mask, job.options.fixed_page)
+        moving = self._source(job.moving, job.moving_mask, job.options.moving_page)
+        with memory.opened(fixed) as still, memory.opened(moving) as mover:
+            yield Both(fixed=still, moving=mover)
 
-    def _ready(self, source: Source) -> Ready:
-        return _memory().ready(source, self.store if source.path in self.again else None)
+    def _source(self, path: str, mask: str | None, page: int) -> Source:
+        store = self.store if path in self.again else None
+        return Source(path=path, mask=mask, page=page, reading=self.job.options.reading, store=store)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,17 +71,12 @@ def do_task(task: Task) -> Done:
     """
     job = task.job
     try:
-        fixed, moving = task.ready()
-        found = _find(job, fixed, moving)
-        written = _write(job, found, fixed.loaded, moving.loaded)
-        _upload(job, written)
+        with task.opened() as both:
+            return _done(job, both)
     except ImageReadError as error:
         return Done(row=_unread_row(job, str(error)))
     except (ImageWriteError, CanvasError, ValueError) as error:
         return Done(row=failed_row(job, str(error)))
-    transform = None if found.kept.fixed_from_moving is None else transform_of(found.kept)
-    small = thumbnails(fixed.loaded.pixels, moving.loaded.pixels, transform)
-    return Done(row=_row(job, found, written), thumbnails=small)
 
 
 def failed_row(job: Job, reason: str) -> Row:
@@ -99,37 +99,58 @@ def _without_result(job: Job, reason: str, advice: str = "") -> Row:
     )
 
 
+def _done(job: Job, both: Both) -> Done:
+    if both.is_large:
+        check_in_strips(job.options.drawing, job.large_output)
+    found = _find(job, both)
+    small = _thumbnails(both, found.kept)
+    written = _write(job, found, both)
+    _upload(job, written)
+    return Done(row=_row(job, found, written), thumbnails=small)
+
+
 @cache
 def _memory() -> PictureMemory:
     """The one thing that a worker keeps from job to job; no result depends on it."""
     return PictureMemory()
 
 
-def _find(job: Job, fixed: Ready, moving: Ready) -> _Found:
+def _find(job: Job, both: Both) -> _Found:
     drawn = {name: value for name, value in asdict(job.options).items() if name not in ("align", "recorded")}
     drawn |= drawn.pop("drawing") | drawn.pop("reading")
     if job.placed is not None:
-        return _Found(kept=placed_record(job.placed, fixed.loaded, moving.loaded, job.options.align, drawn=drawn))
-    alignment = align(fixed.prepared, moving.prepared, job.options.align)
-    kept = record(alignment, fixed.loaded, moving.loaded, drawn=drawn)
-    return _Found(kept=kept, alignment=alignment, advice=alignment.verdict.advice)
+        return _Found(kept=placed_record(job.placed, *both.pictures, job.options.align, drawn=drawn))
+    alignment = align_both(both, job.options.align)
+    kept = record(alignment, *both.pictures, drawn=drawn)
+    advice = alignment.verdict.advice
+    if both.is_large and _is_recorded(job, alignment):
+        advice = "; ".join(filter(None, (advice, NO_RECORDING)))
+    return _Found(kept=kept, alignment=alignment, advice=advice)
 
 
-def _write(job: Job, found: _Found, fixed: LoadedPicture, moving: LoadedPicture) -> set[Path]:
+def _is_recorded(job: Job, alignment: Alignment) -> bool:
+    wanted = job.options.recorded
+    return wanted == "all" or (wanted == "failed" and alignment.status != "aligned")
+
+
+def _thumbnails(both: Both, kept: Sidecar) -> Thumbnails:
+    transform = None if kept.fixed_from_moving is None else both.as_seen(transform_of(kept))
+    fixed, moving = (seen.copy.pixels for seen in both.seen())
+    return thumbnails(fixed, moving, transform)
+
+
+def _write(job: Job, found: _Found, both: Both) -> set[Path]:
     """The files of a pair. Those of an earlier run, when the pair was another, are replaced or taken away."""
     job.output.parent.mkdir(parents=True, exist_ok=True)
-    aligned = found.kept.status == "aligned"
     written = {job.sidecar}
-    if aligned:
-        files = ResultFiles(aligned=job.output)
-        written.update(
-            write_result(files, fixed, moving, transform_of(found.kept), job.options.drawing, overwrite=True)
-        )
+    if found.kept.status == "aligned":
+        files = ResultFiles(aligned=job.large_output if both.is_large else job.output)
+        written.update(write_result(files, both, transform_of(found.kept), job.options.drawing, overwrite=True))
     write_sidecar(job.sidecar, found.kept, overwrite=True)
-    if found.alignment and (job.options.recorded == "all" or (job.options.recorded == "failed" and not aligned)):
+    if both.whole and found.alignment and _is_recorded(job, found.alignment):
         from autoalign.views.viewer import recorded  # not above: rerun is loaded where it is asked for only
 
-        write_bytes_atomically(job.recording, recorded(fixed, moving, found.alignment), overwrite=True)
+        write_bytes_atomically(job.recording, recorded(*both.whole, found.alignment), overwrite=True)
         written.add(job.recording)
     for path in job.outputs:
         if path not in written:
@@ -162,7 +183,7 @@ def _row(job: Job, found: _Found, written: Iterable[Path]) -> Row:
         overlap=kept.evidence.get("overlap", 0.0),
         rung=kept.stages.get("rung"),
         advice=found.advice,
-        output=names.get(job.output),
+        output=names.get(job.output) or names.get(job.large_output),
         sidecar=names.get(job.sidecar),
         recording=names.get(job.recording),
     )

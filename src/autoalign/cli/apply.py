@@ -12,25 +12,17 @@ from cyclopts import Parameter
 from autoalign.cli.files import SCREEN_PIXEL, check_mask_format, check_outputs
 from autoalign.cli.terminal import FILES, GENERAL, Common, Exit, complain, note, progress
 from autoalign.errors import ImageReadError, ImageWriteError
-from autoalign.files.large import (
-    AnyPicture,
-    LargeDrawing,
-    check_large_drawing,
-    opened_picture,
-    write_large_result,
-)
-from autoalign.files.metadata import on_grid_of
+from autoalign.files.large import AnyPicture, check_sized, is_large, opened_picture
 from autoalign.files.points import POSITIONS, read_points, write_points
-from autoalign.files.read import LoadedPicture, ReadOptions
-from autoalign.files.result import ResultFiles, write_mask
+from autoalign.files.read import ReadOptions
+from autoalign.files.result import Placed, ResultFiles, check_in_strips, write_placed
 from autoalign.files.sidecar import Sidecar, read_sidecar, transform_of
-from autoalign.files.sized import check_sized
-from autoalign.files.write import check_format, default_output, write_picture
+from autoalign.files.write import check_format, default_output
 from autoalign.geometry.homography import invert, project
 from autoalign.picture.border import Border, like_bordered
-from autoalign.picture.canvas import CanvasKind, canvas
+from autoalign.picture.canvas import CanvasKind
 from autoalign.picture.warp import Interpolation
-from autoalign.registration.drawing import Drawing, draw
+from autoalign.registration.drawing import Drawing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,27 +120,19 @@ def _put(
     if picture.remark:
         note(f"{picture.remark}: {picture.path}", common)
     check_format(output, like_bordered(picture.pixels, drawing.border))
-    transform = transform_of(record)
-    if isinstance(picture, LoadedPicture):
-        drawn = draw(picture.pixels, record.fixed.size, transform, drawing, interpolation=options.interpolation)
-        metadata = on_grid_of(None, picture.metadata, drawn.frame, transform, record.moving.size)
-        write_picture(output, drawn.warped.pixels, metadata, overwrite=common.overwrite)
-        if options.save_mask:
-            write_mask(options.save_mask, drawn.warped, common.overwrite)
-    else:
-        check_large_drawing(drawing, output, options.save_mask)
-        frame = canvas(drawing.canvas, record.fixed.size, record.moving.size, transform)
-        what = LargeDrawing(
-            pixels=picture.pixels,
-            frame=frame,
-            fixed_from_moving=transform,
-            drawing=drawing,
-            interpolation=options.interpolation,
-        )
-        metadata = on_grid_of(None, picture.metadata, frame, transform, record.moving.size)
-        files = ResultFiles(aligned=output, mask=options.save_mask)
-        write_large_result(files, what, metadata, None, progress("drawing", common), common.overwrite)
-    note(f"wrote {', '.join(str(path) for path in (output, options.save_mask) if path)}", common)
+    if is_large(picture):
+        check_in_strips(drawing, output, options.save_mask)
+    files = ResultFiles(aligned=output, mask=options.save_mask)
+    what = Placed(
+        picture=picture,
+        fixed_size=record.fixed.size,
+        fixed_from_moving=transform_of(record),
+        drawing=drawing,
+        interpolation=options.interpolation,
+    )
+    watch = progress("drawing", common)
+    write_placed(files, what, None, in_strips=is_large(picture), watch=watch, overwrite=common.overwrite)
+    note(f"wrote {', '.join(map(str, files.wanted))}", common)
 
 
 def _map_points(record: Sidecar, path: Path, options: ApplyOptions, common: Common) -> int:

@@ -14,34 +14,19 @@ from autoalign.cli.files import SCREEN_PIXEL, check_mask_format, check_outputs
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, note, progress, tell
 from autoalign.cli.view import Viewing, check_viewing, recording_beside, show
 from autoalign.files.formats import TIFF, of_name
-from autoalign.files.large import (
-    AnyPicture,
-    LargeDrawing,
-    check_large_drawing,
-    is_large,
-    opened_picture,
-    read_mask_of_copy,
-    with_copy,
-    write_large_result,
-)
-from autoalign.files.metadata import on_grid_of
 from autoalign.files.points import CORRESPONDENCES, read_points
-from autoalign.files.read import LoadedPicture, ReadOptions
+from autoalign.files.read import ReadOptions
+from autoalign.files.ready import Both, Source, align_both, opened_source
 from autoalign.files.record import record
-from autoalign.files.result import ResultFiles, write_result
+from autoalign.files.result import ResultFiles, check_in_strips, write_result
 from autoalign.files.sidecar import default_sidecar, sidecar_text, write_sidecar
-from autoalign.files.sized import read_mask
 from autoalign.files.write import default_output
-from autoalign.geometry.homography import Array
 from autoalign.geometry.ransac import RansacOptions
 from autoalign.picture.border import like_bordered
-from autoalign.picture.canvas import canvas
 from autoalign.picture.compose import STYLES
 from autoalign.picture.pixels import Picture, size_of
-from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment, AlignOptions
 from autoalign.registration.drawing import Drawing
-from autoalign.registration.large import Large, align_large
 from autoalign.registration.refine import RefineOptions
 from autoalign.registration.typed import align_points
 from autoalign.registration.verdict import VerdictOptions
@@ -49,9 +34,6 @@ from autoalign.registration.verdict import VerdictOptions
 # One flag per field of every stage, under the field's own name and a heading of the stage's.
 for stage, heading in ((RansacOptions, "Consensus"), (RefineOptions, "Refinement"), (VerdictOptions, "Verdict")):
     Parameter(name="*", group=Group(heading, sort_key=3))(stage)
-
-Copies = tuple[Large, Large]
-"""Two pictures of which at least one is too large for memory."""
 
 STDOUT = Path("-")
 
@@ -107,21 +89,21 @@ def pair(
     """
     started = time.perf_counter()
     with (
-        opened_picture(fixed, reading, page=files.fixed_page) as still,
-        opened_picture(moving, reading, page=files.moving_page) as mover,
+        opened_source(_source(fixed, files.fixed_mask, files.fixed_page, reading)) as still,
+        opened_source(_source(moving, files.moving_mask, files.moving_page, reading)) as mover,
     ):
-        for loaded in (still, mover):
-            if loaded.remark:
-                note(f"{loaded.remark}: {loaded.path}", common)
-        large = is_large(still) or is_large(mover)
-        drawn = like_bordered(mover.pixels, drawing.border)
-        output = files.output or _default_output(moving, drawn, large)
+        both = Both(fixed=still, moving=mover)
+        for picture in both.pictures:
+            if picture.remark:
+                note(f"{picture.remark}: {picture.path}", common)
+        drawn = like_bordered(mover.picture.pixels, drawing.border)
+        output = files.output or _default_output(moving, drawn, both.is_large)
         sidecar = None if files.json == STDOUT else files.json or default_sidecar(output)
         beside = recording_beside(sidecar or default_sidecar(output))
         recording = check_viewing(viewing, beside)
         check_mask_format(files.save_mask)
-        if large:
-            check_large_drawing(drawing, output, files.save_mask)
+        if both.is_large:
+            check_in_strips(drawing, output, files.save_mask)
             _check_not_viewed(viewing)
         check_outputs(
             [
@@ -134,20 +116,20 @@ def pair(
             inputs=[fixed, moving, files.points, files.fixed_mask, files.moving_mask],
             overwrite=common.overwrite,
         )
-        copies = (with_copy(still), with_copy(mover)) if large else None
-        alignment = _align(still, mover, copies, files, options)
+        alignment = _align(both, files, options)
         written = []
         if alignment.status != "rejected":
-            pictures = ResultFiles(
+            results = ResultFiles(
                 aligned=output if alignment.status == "aligned" else None,
                 mask=files.save_mask if alignment.status == "aligned" else None,
                 overlay=files.overlay,
                 overlay_style=files.overlay_style,
             )
-            written = _write(pictures, still, mover, copies, alignment.fixed_from_moving, drawing, common)
+            watch = progress("drawing", common)
+            written = write_result(results, both, alignment.fixed_from_moving, drawing, watch, common.overwrite)
         pages = {"fixed_page": files.fixed_page, "moving_page": files.moving_page}
         drawn_from = asdict(drawing) | asdict(reading) | pages
-        kept = record(alignment, still, mover, drawn=drawn_from, timings=files.timings)
+        kept = record(alignment, *both.pictures, drawn=drawn_from, timings=files.timings)
         if sidecar is None:
             sys.stdout.write(sidecar_text(kept))
         else:
@@ -164,8 +146,8 @@ def pair(
             note(f"left as it was, from an earlier run: {output}", common)
         if written:
             note(f"wrote {', '.join(map(str, written))}", common)
-        if viewing and isinstance(still, LoadedPicture) and isinstance(mover, LoadedPicture):
-            show(alignment, (still, mover), viewing, recording, beside, timings=files.timings, common=common)
+        if viewing and both.whole:
+            show(alignment, both.whole, viewing, recording, beside, timings=files.timings, common=common)
         return Exit.DONE if alignment.status == "aligned" else Exit.NOT_ALIGNED
 
 
@@ -194,47 +176,18 @@ def _check_not_viewed(viewing: Viewing) -> None:
         raise ValueError("pictures of so many pixels are not recorded for the viewer; --overlay shows them")
 
 
-def _align(
-    fixed: AnyPicture, moving: AnyPicture, copies: Copies | None, files: PairFiles, options: AlignOptions
-) -> Alignment:
-    masks = (files.fixed_mask, files.moving_mask)
-    if files.points is not None:
-        if any(masks):
-            raise ValueError("--points leaves nothing to look for, so that a mask has no use")
-        points = read_points(files.points, CORRESPONDENCES)
-        return align_points(points[:, :2], points[:, 2:], size_of(fixed.pixels), size_of(moving.pixels), options)
-    if copies is not None:
-        fixed_valid, moving_valid = (
-            None if mask is None else read_mask_of_copy(mask, of) for mask, of in zip(masks, copies, strict=True)
-        )
-        return align_large(*copies, options, fixed_valid=fixed_valid, moving_valid=moving_valid)
-    assert isinstance(fixed, LoadedPicture), "only of a large one there is a copy"
-    assert isinstance(moving, LoadedPicture), "only of a large one there is a copy"
-    fixed_valid, moving_valid = (
-        None if mask is None else read_mask(mask, size_of(of.pixels)).valid
-        for mask, of in zip(masks, (fixed, moving), strict=True)
-    )
-    return align(fixed.pixels, moving.pixels, options, fixed_valid=fixed_valid, moving_valid=moving_valid)
+def _source(path: Path, mask: Path | None, page: int, reading: ReadOptions) -> Source:
+    return Source(path=str(path), mask=None if mask is None else str(mask), page=page, reading=reading)
 
 
-def _write(
-    pictures: ResultFiles,
-    fixed: AnyPicture,
-    moving: AnyPicture,
-    copies: Copies | None,
-    fixed_from_moving: Array,
-    drawing: Drawing,
-    common: Common,
-) -> list[Path]:
-    """Draw what is wanted of the result, as a whole or strip by strip."""
-    if isinstance(fixed, LoadedPicture) and isinstance(moving, LoadedPicture):
-        return write_result(pictures, fixed, moving, fixed_from_moving, drawing, common.overwrite)
-    assert copies is not None
-    sizes = size_of(fixed.pixels), size_of(moving.pixels)
-    frame = canvas(drawing.canvas, *sizes, fixed_from_moving)
-    what = LargeDrawing(pixels=moving.pixels, frame=frame, fixed_from_moving=fixed_from_moving, drawing=drawing)
-    metadata = on_grid_of(fixed.metadata, moving.metadata, frame, fixed_from_moving, sizes[1])
-    return write_large_result(pictures, what, metadata, copies, progress("drawing", common), common.overwrite)
+def _align(both: Both, files: PairFiles, options: AlignOptions) -> Alignment:
+    if files.points is None:
+        return align_both(both, options)
+    if files.fixed_mask or files.moving_mask:
+        raise ValueError("--points leaves nothing to look for, so that a mask has no use")
+    points = read_points(files.points, CORRESPONDENCES)
+    fixed_size, moving_size = (size_of(picture.pixels) for picture in both.pictures)
+    return align_points(points[:, :2], points[:, 2:], fixed_size, moving_size, options)
 
 
 def _tell_stages(alignment: Alignment) -> None:
