@@ -12,24 +12,9 @@ import pytest
 
 from autoalign.files.export import SCHEMA, as_csv, as_json, as_parquet
 from autoalign.files.row import Row
+from rows import ALIGNED, FAILED
 
-ALIGNED = Row(
-    name='a, "b"\nÅ.jpg',
-    fixed="reference.png",
-    moving="in/a.jpg",
-    status="aligned",
-    reason="31 of 40 matches agree",
-    expected_error_px=0.1 + 0.2,
-    model="homography",
-    fixed_from_moving=((1.0, 1 / 3, -2.5), (0.0, 1.1, 4e-17), (1e-7, 0.0, 1.0)),
-    fixed_size=(640, 480),
-    moving_size=(800, 601),
-    matches=40,
-    inliers=31,
-    overlap=0.875,
-)
-FAILED = Row(name="b", fixed="reference.png", moving="b", status="failed", reason="is no picture: b")
-ROWS = [ALIGNED, FAILED]
+ROWS = [replace(ALIGNED, name='a, "b"\nÅ.jpg'), FAILED]
 NOT_UTF8 = replace(FAILED, name="\udcff.jpg")
 
 

@@ -20,27 +20,9 @@ from autoalign.errors import ImageWriteError
 from autoalign.files.row import Row, Thumbnails
 from autoalign.views.pictures import thumbnails
 from autoalign.views.report import write_report
+from rows import ALIGNED, FAILED
 
 SHIFTED = ((1.0, 0.0, 3.0), (0.0, 1.0, -4.0), (0.0, 0.0, 1.0))
-ALIGNED = Row(
-    name="a.jpg",
-    fixed="reference.jpg",
-    moving="in/a.jpg",
-    status="aligned",
-    reason="412 of 500 matches agree",
-    expected_error_px=0.05,
-    model="homography",
-    fixed_from_moving=SHIFTED,
-    fixed_size=(300, 200),
-    moving_size=(300, 200),
-    matches=500,
-    inliers=412,
-    overlap=0.93,
-    rung="fast",
-    output="a.jpg",
-    sidecar="a.autoalign.json",
-)
-FAILED = Row(name="b.jpg", fixed="reference.jpg", moving="in/b.jpg", status="failed", reason="is empty: in/b.jpg")
 HOSTILE = (
     "</script><script>alert(1)</script>.png",
     "<!--<script>.png",
@@ -101,8 +83,8 @@ def shown(seed: int) -> Thumbnails:
 
 
 def test_a_row_is_all_there(tmp_path: Path) -> None:
-    pictures = shown(0)
-    found = page(tmp_path, (ALIGNED, pictures))
+    pictures, shifted = shown(0), replace(ALIGNED, fixed_from_moving=SHIFTED)
+    found = page(tmp_path, (shifted, pictures))
     (row,) = found.rows
     for name in (
         "name",
@@ -116,10 +98,10 @@ def test_a_row_is_all_there(tmp_path: Path) -> None:
         "matches",
         "inliers",
     ):
-        assert row[name] == getattr(ALIGNED, name)
+        assert row[name] == getattr(shifted, name)
     assert row["shift_px"] == pytest.approx(5.0)
     assert row["motion"] == "turned by 0.0°, 1 times as large"
-    assert row["links"] == {"output": "./a.jpg", "sidecar": "./a.autoalign.json"}
+    assert row["links"] == {"output": "./a.jpg", "sidecar": "./a.jpg.autoalign.json"}
     assert isinstance(row["thumbnails"], list)
     assert [found.picture(number) for number in row["thumbnails"]] == [pictures.fixed, pictures.before, pictures.after]
 
@@ -161,7 +143,7 @@ def test_the_summary_counts(tmp_path: Path) -> None:
     words = " ".join(found.words.split())
     assert "5 pairs" in words
     assert "all 5 ✓ aligned 3 ⚠ doubtful 1 ✗ rejected 0 ! failed 1" in words
-    assert "median of the aligned0.05 px" in words
+    assert "median of the aligned0.3 px" in words
     assert "worst of the aligned: worst.jpg0.9 px" in words
     assert [attributes["data-show"] for _, attributes in found.tags if "data-show" in attributes] == ["3"]
     assert "options" in words
