@@ -22,26 +22,8 @@ from autoalign.batch.ledger import FILE_NAME, LOCAL_FILE_SYSTEMS, Entry, Ledger,
 from autoalign.batch.schema import SCHEMA_VERSION, columns_of, row_of
 from autoalign.errors import ImageReadError, ImageWriteError
 from autoalign.files.row import ROW_STATUSES, Row, Thumbnails
+from rows import ALIGNED, FAILED
 
-FULL = Row(
-    name="a/IMG 1.jpg",
-    fixed="reference.png",
-    moving="in/a/IMG 1.jpg",
-    status="aligned",
-    reason="31 of 40 matches agree",
-    expected_error_px=0.1 + 0.2,  # no number with few digits
-    model="homography",
-    fixed_from_moving=((1.0, 1 / 3, -2.5), (0.0, 1.1, 4e-17), (1e-7, 0.0, 1.0)),
-    fixed_size=(640, 480),
-    moving_size=(800, 601),
-    matches=40,
-    inliers=31,
-    overlap=0.875,
-    rung="sift",
-    output="a/IMG 1.jpg",
-    sidecar="a/IMG 1.jpg.autoalign.json",
-)
-FAILED = Row(name="b", fixed="reference.png", moving="b", status="failed", reason="is no picture: b")
 THUMBNAILS = Thumbnails(fixed=b"\xff\xd8fixed", before=b"\xff\xd8before", after=None)
 
 
@@ -50,11 +32,11 @@ def entry(row: Row, key: str | None = None) -> Entry:
 
 
 def some(count: int) -> list[Row]:
-    return [replace(FULL, name=f"{number}.png", moving=f"in/{number}.png") for number in range(count)]
+    return [replace(ALIGNED, name=f"{number}.png", moving=f"in/{number}.png") for number in range(count)]
 
 
 def test_rows_come_back_as_they_were_in_the_order_of_the_plan(tmp_path: Path) -> None:
-    rows = [*some(20), FULL, FAILED]
+    rows = [*some(20), ALIGNED, FAILED]
     with Ledger(tmp_path) as ledger:
         ledger.plan(map(entry, rows))
         for row in random.Random(1).sample(rows, len(rows)):
@@ -115,7 +97,7 @@ def test_a_second_run_does_what_is_new_or_changed(tmp_path: Path) -> None:
         assert ledger.pending() == [entry(rows[3]).key, "another key"]  # what waited and is not planned is forgotten
         assert list(ledger.rows()) == [rows[0]]
         assert ledger.thumbnails(rows[1].name) is None
-        assert ledger.names() == {rows[3].name, rows[0].name, rows[1].name}
+        assert ledger.known([row.name for row in rows]) == {rows[3].name, rows[0].name, rows[1].name}
 
 
 def test_more_jobs_come_after_those_there_are(tmp_path: Path) -> None:
@@ -126,8 +108,22 @@ def test_more_jobs_come_after_those_there_are(tmp_path: Path) -> None:
         assert ledger.pending() == [entry(row).key for row in rows]
 
 
+def test_jobs_are_found_by_their_names_however_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ledger_module, "AT_ONCE", 7)
+    rows = [*some(20), replace(FAILED, name="\udcff.png")]
+    with Ledger(tmp_path) as ledger:
+        ledger.plan(entry(row, str(place)) for place, row in enumerate([*rows, replace(ALIGNED, name="not asked for")]))
+        for place, row in enumerate(rows):
+            if place != 3:
+                ledger.keep(str(place), row)
+        asked = random.Random(1).sample(rows, len(rows))
+        names = ["nobody", *(row.name for row in asked)]
+        assert ledger.known(names) == {row.name for row in rows}
+        assert ledger.rows_of(names) == [row for row in asked if row is not rows[3]]
+
+
 def test_counts_name_every_state(tmp_path: Path) -> None:
-    rows = [FULL, FAILED, *some(3)]
+    rows = [ALIGNED, FAILED, *some(3)]
     with Ledger(tmp_path) as ledger:
         ledger.plan(map(entry, rows))
         for row in rows[:2]:
@@ -152,32 +148,32 @@ def test_the_worst_are_those_that_need_a_person(tmp_path: Path) -> None:
 
 
 def test_what_is_kept_again_replaces_what_was(tmp_path: Path) -> None:
-    later = replace(FULL, status="doubtful")
+    later = replace(ALIGNED, status="doubtful")
     with Ledger(tmp_path) as ledger:
-        ledger.plan([entry(FULL)])
-        ledger.keep(entry(FULL).key, FULL, THUMBNAILS)
-        assert ledger.thumbnails(FULL.name) == THUMBNAILS
-        ledger.keep(entry(FULL).key, later)
+        ledger.plan([entry(ALIGNED)])
+        ledger.keep(entry(ALIGNED).key, ALIGNED, THUMBNAILS)
+        assert ledger.thumbnails(ALIGNED.name) == THUMBNAILS
+        ledger.keep(entry(ALIGNED).key, later)
         assert list(ledger.rows()) == [later]
-        assert ledger.thumbnails(FULL.name) is None
+        assert ledger.thumbnails(ALIGNED.name) is None
 
 
 def test_what_is_reopened_waits_again(tmp_path: Path) -> None:
     with Ledger(tmp_path) as ledger:
-        ledger.plan([entry(FULL), entry(FAILED)])
-        ledger.keep(entry(FULL).key, FULL)
+        ledger.plan([entry(ALIGNED), entry(FAILED)])
+        ledger.keep(entry(ALIGNED).key, ALIGNED)
         ledger.keep(entry(FAILED).key, FAILED)
         ledger.reopen(row.name for row in ledger.rows("failed"))
-        assert (ledger.pending(), list(ledger.rows())) == ([entry(FAILED).key], [FULL])
+        assert (ledger.pending(), list(ledger.rows())) == ([entry(FAILED).key], [ALIGNED])
 
 
 def test_wrong_calls(tmp_path: Path) -> None:
     with Ledger(tmp_path) as ledger:
-        with pytest.raises(ValueError, match=r"the job a/IMG 1\.jpg is not planned"):
-            ledger.keep("no key", FULL)
-        with pytest.raises(ValueError, match=r"two jobs of the batch have the name a/IMG 1\.jpg"):
-            ledger.plan([entry(FULL, "one"), entry(FULL, "two")])
-        assert ledger.names() == set()
+        with pytest.raises(ValueError, match=r"the job a\.jpg is not planned"):
+            ledger.keep("no key", ALIGNED)
+        with pytest.raises(ValueError, match=r"two jobs of the batch have the name a\.jpg"):
+            ledger.plan([entry(ALIGNED, "one"), entry(ALIGNED, "two")])
+        assert ledger.known([ALIGNED.name]) == set()
 
 
 def test_links_are_kept(tmp_path: Path) -> None:
@@ -191,8 +187,8 @@ def test_runs_and_times(tmp_path: Path) -> None:
     before = time.time()
     with Ledger(tmp_path) as ledger:
         ledger.begin_run({"effort": "auto"})
-        ledger.plan([entry(FULL)])
-        ledger.keep(entry(FULL).key, FULL)
+        ledger.plan([entry(ALIGNED)])
+        ledger.keep(entry(ALIGNED).key, ALIGNED)
         with LedgerReader(tmp_path) as reader:
             assert [run.ended for run in reader.runs()] == [None]
     with LedgerReader(tmp_path) as reader:
@@ -218,10 +214,10 @@ def test_anyone_may_read_while_it_is_written(tmp_path: Path) -> None:
 def test_where_a_disk_is_not_this_machines_there_is_no_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ledger_module, "_file_system", lambda path: "nfs4")
     with Ledger(tmp_path) as ledger:
-        ledger.plan([entry(FULL)])
+        ledger.plan([entry(ALIGNED)])
         with LedgerReader(tmp_path) as reader:
-            ledger.keep(entry(FULL).key, FULL)
-            assert list(reader.rows()) == [FULL]
+            ledger.keep(entry(ALIGNED).key, ALIGNED)
+            assert list(reader.rows()) == [ALIGNED]
             assert not (tmp_path / f"{FILE_NAME}-wal").exists()
 
 
@@ -233,7 +229,7 @@ def test_this_disk_is_one_of_this_machine(tmp_path: Path) -> None:
 
 def test_one_plain_file_is_left(tmp_path: Path) -> None:
     with Ledger(tmp_path) as ledger:
-        ledger.plan([entry(FULL)])
+        ledger.plan([entry(ALIGNED)])
     assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".")] == [FILE_NAME]
 
 

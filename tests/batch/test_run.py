@@ -16,15 +16,17 @@ import pytest
 import autoalign as aa
 from autoalign.batch.engine import InlineEngine
 from autoalign.batch.jobs import Job, JobOptions
-from autoalign.batch.ledger import FILE_NAME, Ledger, LedgerReader
+from autoalign.batch.ledger import FILE_NAME, Entry, Ledger, LedgerReader
 from autoalign.batch.run import STORE_NAME, PlanOptions, align_batch, carry_out, feature_store, planned
 from autoalign.batch.slot import Casualty, Outcome
 from autoalign.batch.sources import Selection, onto_reference, pictures
 from autoalign.batch.telling import RECORDING, REPORT
+from autoalign.batch.work import Done
 from autoalign.errors import ImageWriteError
 from autoalign.files.row import Row
 from autoalign.files.write import TEMPORARY
 from autoalign.registration.alignment import AlignOptions
+from rows import ALIGNED
 
 
 def jobs_of(folder: Path, out: Path, options: JobOptions | None = None) -> list[Job]:
@@ -128,7 +130,7 @@ def test_nothing_that_is_no_result_is_overwritten(folder, tmp_path):
 
 def test_what_writers_that_were_killed_left_is_swept(folder, tmp_path):
     out = tmp_path / "out"
-    out.mkdir()
+    run(jobs_of(folder, out), out)
     left = out / TEMPORARY.format("0123")
     left.write_text("half a pict")
     run(jobs_of(folder, out), out)
@@ -164,6 +166,38 @@ def test_the_library_yields_rows_without_a_ledger(folder, tmp_path):
     rows = list(align_batch(jobs_of(folder, tmp_path / "out"), InlineEngine()))
     assert sorted(row.status for row in rows) == ["aligned", "aligned", "failed", "rejected"]
     assert not (tmp_path / "out" / FILE_NAME).exists()
+
+
+def test_what_arrives_costs_the_ledger_the_same_however_much_it_holds(folder, tmp_path):
+    long_ago = 1e9  # so that all hashes are remembered
+    for name in ("frame1.png", "frame2.png"):
+        os.utime(folder / name, (long_ago, long_ago))
+    work = [work_of_one_arrival(folder, tmp_path / str(before), before) for before in (10, 2000)]
+    assert work[0] == work[1] > 100
+
+
+def work_of_one_arrival(folder: Path, out: Path, before: int) -> int:
+    """Instructions that SQLite carries out from the plan to the row, on top of so many jobs that are done."""
+    out.mkdir()
+    done = [replace(ALIGNED, name=f"before{k}.png") for k in range(before)]
+    (job,) = onto_reference(folder, ["frame2.png"], folder / "frame1.png", out, JobOptions())
+    arrived = replace(ALIGNED, name=job.name)
+    steps = 0
+
+    def count() -> None:
+        nonlocal steps
+        steps += 1
+
+    with Ledger(out) as ledger, feature_store(out, None) as store:
+        ledger.plan(Entry(key=row.name, name=row.name, fixed=row.fixed, moving=row.moving) for row in done)
+        for row in done:
+            ledger.keep(row.name, row)
+        ledger._database.set_progress_handler(count, 1)
+        plan = planned([job], out, ledger, store, PlanOptions(more=True))
+        assert list(carry_out(plan, ledger, InlineEngine(), function=lambda task: Done(row=arrived))) == [arrived]
+        ledger._database.set_progress_handler(None, 1)
+        assert len(list(ledger.rows())) == before + 1
+    return steps
 
 
 def many(folder: Path, count: int) -> None:

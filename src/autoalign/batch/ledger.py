@@ -11,7 +11,7 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ import psutil
 from autoalign import __version__
 from autoalign.batch.schema import (
     APPLICATION_ID,
+    FORGET,
     KEEP,
     PLAN,
     SCHEMA,
@@ -44,6 +45,7 @@ LOCK_NAME = ".autoalign.lock"
 PATIENCE_S = 10.0  # on disks where writer and readers take turns
 SETTLED_NS = 2_000_000_000  # a file younger than this may change again without a change of its time stamp
 HASHING_S = 1.0  # at most so much hashing is lost by a crash
+AT_ONCE = 999  # values in a question; SQLite before 3.32 takes no more
 
 # File systems whose locks and shared memory are those of one machine, as a write-ahead log needs them.
 LOCAL_FILE_SYSTEMS = frozenset(
@@ -105,15 +107,20 @@ class LedgerReader:
         """The keys of what is to be done, in the order of the plan."""
         return [key for (key,) in self._found(f"SELECT key FROM job WHERE {WAITS} ORDER BY place, name")]
 
-    def names(self) -> set[str]:
-        """Of all jobs, done or not."""
-        return {name for (name,) in self._found("SELECT name FROM job")}
+    def known(self, names: Sequence[str]) -> set[str]:
+        """Those of the names that jobs have, done or not."""
+        return {name for (name,) in self._found_of(names, "SELECT name FROM job")}
 
     def rows(self, *statuses: RowStatus) -> Iterator[Row]:
         """What was done, or of it what has one of these statuses, in the order of the plan, whoever came first."""
         chosen = statuses or ROW_STATUSES
         places = ", ".join("?" * len(chosen))
         yield from map(row_of, self._found(f"{SELECT_ROWS} WHERE status IN ({places}) ORDER BY place, name", *chosen))
+
+    def rows_of(self, names: Sequence[str]) -> list[Row]:
+        """What was done of the jobs with these names, in their order; takes no longer where there are many others."""
+        found = {row.name: row for row in map(row_of, self._found_of(names, SELECT_ROWS))}
+        return [found[name] for name in names if name in found]
 
     def worst(self, count: int = 10) -> list[Row]:
         """Those that need a person first: failed, rejected, doubtful; then the largest expected errors."""
@@ -147,6 +154,12 @@ class LedgerReader:
     def finished_since(self, moment: float) -> int:
         """How many rows were kept from that moment on, in seconds since 1970."""
         return int(self._found("SELECT count(*) FROM result WHERE finished >= ?", moment)[0][0])
+
+    def _found_of(self, names: Sequence[str], sql: str) -> Iterator[Any]:
+        """Of the jobs with these names only, in any order."""
+        for start in range(0, len(names), AT_ONCE):
+            some = names[start : start + AT_ONCE]
+            yield from self._found(f"{sql} WHERE name IN ({', '.join([TEXT] * len(some))})", *map(bound, some))
 
     def _found(self, sql: str, *values: Any) -> list[Any]:
         """All at once: a reader that takes its time would keep the writer waiting on disks where they take turns."""
@@ -229,12 +242,13 @@ class Ledger(LedgerReader):
         Raises ValueError if two have one name.
         """
         with self._writing() as database:
-            (first,) = database.execute("SELECT coalesce(max(place) + 1, 0) FROM job WHERE ?", (more,)).fetchone()
+            (last,) = database.execute("SELECT max(place) FROM job").fetchone()
             if not more:
                 database.execute(f"UPDATE job SET place = NULL WHERE {WAITS}")
-            database.executemany(PLAN, _numbered(entries, first))
+            values = list(_numbered(entries, last + 1 if more and last is not None else 0))
+            database.executemany(FORGET, [(name, key) for name, key, *_ in values])
+            database.executemany(PLAN, values)
             database.execute("DELETE FROM job WHERE place IS NULL")
-            database.execute("DELETE FROM result WHERE key NOT IN (SELECT key FROM job)")
 
     def keep(self, key: str, row: Row, thumbnails: Thumbnails | None = None, *, seconds: float = 0.0) -> None:
         """Keep what became of a planned job, and the seconds it took; what was kept of it before is replaced.

@@ -95,24 +95,27 @@ def planned(
     """
     options = options or PlanOptions()
     keyed = by_key(jobs, ledger.hash_of)
+    names = [job.name for job in jobs]
+    known = ledger.known(names)
     if not options.overwrite:
-        _check_strangers(jobs, ledger.names())
+        _check_strangers(job for job in jobs if job.name not in known)
     entries = (
         Entry(key=of, name=job.name, fixed=shown(job.fixed), moving=shown(job.moving)) for of, job in keyed.items()
     )
     ledger.plan(entries, more=options.more)
-    mine = {job.name for job in jobs}
-    rows = [row for row in ledger.rows() if row.name in mine]
-    ledger.reopen(row.name for row in rows if _is_gone(row, out_dir) or (options.retry and row.status == "failed"))
-    _sweep({os.path.dirname(os.path.join(job.out_dir, job.name)) for job in jobs})
+    rows = ledger.rows_of(names)
+    undone = [row.name for row in rows if _is_gone(row, out_dir) or (options.retry and row.status == "failed")]
+    ledger.reopen(undone)
+    done = {row.name for row in rows}.difference(undone)
+    _sweep({os.path.dirname(os.path.join(job.out_dir, job.name)) for job in jobs if job.name in known})
     uses = Counter(path for job in jobs for path in job.inputs)
     again = options.again or frozenset(path for path, count in uses.items() if count > 1)
     tasks = tuple(
-        Task(job=keyed[of], key=of, store=str(store), again=again.intersection(keyed[of].inputs))
-        for of in ledger.pending()
-        if of in keyed
+        Task(job=job, key=of, store=str(store), again=again.intersection(job.inputs))
+        for of, job in keyed.items()
+        if job.name not in done
     )
-    return Plan(tasks=tasks, done=len(keyed) - len(tasks))
+    return Plan(tasks=tasks, done=len(done))
 
 
 def carry_out(
@@ -151,10 +154,10 @@ def _is_gone(row: Row, out_dir: Path) -> bool:
     return any(path and not (out_dir / path).exists() for path in (row.output, row.sidecar, row.recording))
 
 
-def _check_strangers(jobs: Iterable[Job], known: set[str]) -> None:
-    """Raise ImageWriteError, the path last, for a file in the way of a job that the ledger has never heard of."""
+def _check_strangers(jobs: Iterable[Job]) -> None:
+    """Raise ImageWriteError, the path last, for a file in the way of these, of which the ledger has never heard."""
     for job in jobs:
-        for path in job.places if job.name not in known else ():
+        for path in job.places:
             if os.path.exists(path):
                 raise ImageWriteError(f"exists already, and is no result of this batch: {path}")
 

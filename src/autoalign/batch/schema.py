@@ -38,6 +38,7 @@ SCHEMA = (
         name TEXT PRIMARY KEY, key TEXT NOT NULL UNIQUE, fixed TEXT NOT NULL, moving TEXT NOT NULL,
         place INTEGER, attempts INTEGER NOT NULL DEFAULT 0
     )""",
+    "CREATE INDEX job_place ON job (place, name)",  # a ledger without it is read and kept as well, but slower
     f"""CREATE TABLE result (
         key TEXT PRIMARY KEY, finished REAL NOT NULL, seconds REAL NOT NULL,
         {", ".join(f"{name} {affinity}" for name, affinity in AFFINITIES.items())}
@@ -59,6 +60,7 @@ PLAN = f"""
         attempts = CASE key WHEN excluded.key THEN attempts ELSE 0 END,
         key = excluded.key, fixed = excluded.fixed, moving = excluded.moving, place = excluded.place
 """
+FORGET = f"DELETE FROM result WHERE key = (SELECT key FROM job WHERE name = {TEXT} AND key != ?)"
 KEEP = f"""
     INSERT OR REPLACE INTO result (key, finished, seconds, {", ".join(RESULT)})
     VALUES (?, ?, ?, {", ".join(TEXT if affinity == "TEXT" else "?" for affinity in AFFINITIES.values())})

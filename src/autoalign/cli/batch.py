@@ -103,8 +103,7 @@ def batch(
         with following("pairs", len(plan.tasks), common.quiet) as follow:
             for row in carry_out(plan, ledger, engine, fail_fast=again.fail_fast):
                 follow(row.status)
-        mine = {job.name for job in jobs}
-        rows = [row for row in ledger.rows() if row.name in mine]
+        rows = ledger.rows_of([job.name for job in jobs])
         reports = write_reports(files.out_dir, ledger, about, sequence=files.sequence, recorded=True)
     _tell_end(rows, len(jobs), plan.done, time.monotonic() - started, common)
     note(f"wrote {', '.join(map(str, reports))}", common)
@@ -165,7 +164,7 @@ def _tell_plan(jobs: Sequence[Job], reference: int | None, out_dir: Path) -> Exi
     known = {}
     if (out_dir / LEDGER).exists():
         with LedgerReader(out_dir) as ledger:
-            known = {row.name: row.status for row in ledger.rows()}
+            known = {row.name: row.status for row in ledger.rows_of([job.name for job in jobs])}
     for job in jobs:
         before = f" ({known[job.name]} before)" if job.name in known else ""
         print(f"{shown(job.moving)} -> {shown(job.fixed)}: {job.output}{before}")
