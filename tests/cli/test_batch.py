@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import autoalign as aa
+from autoalign.batch.run import carry_out
+from autoalign.batch.sources import Selection
+from autoalign.cli import watch
 from autoalign.cli.progress import clock, following, tally
 
 
@@ -138,6 +144,32 @@ def test_watching_until_nothing_comes(shots, run):
     second = run("watch", "in", *words, "--upload", f"file://{shots}/up")
     assert (second.code, second.out) == (0, "nothing new arrived\n")
     assert run("watch", "nowhere", *words).code == run("watch", "in", *("--reference", "x.png", *words[2:])).code == 3
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_a_watch_that_is_told_to_end_reports_what_it_has_done(shots, run, monkeypatch, end):
+    def told_to_end(*words):
+        for row in carry_out(*words):
+            yield row
+            signal.raise_signal(end)
+
+    monkeypatch.setattr(watch, "carry_out", told_to_end)
+    outcome = run("watch", "in", "--reference", "in/fixed.jpg", "--out-dir", "out", "--workers", "1")
+    assert (outcome.code, outcome.out.splitlines()[-1]) == (0, "1 pairs: 1 aligned")
+    report = (shots / "out" / "report.html").read_text()
+    assert "moving.jpg" in report
+    assert "torn.jpg" not in report
+
+
+def test_a_folder_is_looked_at_when_the_caller_asks_although_nothing_came(shots):
+    for path in Path("in").iterdir():
+        os.utime(path, (1e9, 1e9))  # whole
+    files = watch.WatchFiles(reference=Path("in/fixed.jpg"), out_dir=Path("out"), rescan=30.0)
+    looks = watch._arriving(Path("in"), Selection(), files, lambda: 0.01)
+    started = time.monotonic()
+    assert [next(looks), next(looks)] == [["fixed.jpg", "moving.jpg", "torn.jpg"], []]
+    assert time.monotonic() - started < 20
+    looks.close()
 
 
 def test_plain_lines_where_there_is_no_terminal(capsys):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 
-from autoalign.batch.sources import Selection, found_pictures
+from autoalign.batch.sources import Selection, found_pictures, natural
 
 SETTLED_S = 2.0
 
@@ -48,18 +48,22 @@ class Arrivals:
         self._closed.add(os.path.abspath(path))
 
     def take(self) -> list[str]:
-        """The pictures, relative to the folder, that are whole and were not taken as they are now."""
+        """The pictures, relative to the folder, that are whole and were not taken as they are now.
+
+        In the order that people count in.
+        """
         now, there = self._clock(), {}
         for name in found_pictures(self._folder, self._selection, without=self._without):
             with suppress(OSError):  # gone meanwhile
-                there[name] = _stamp(self._folder / name)
-        ready = [
-            name for name, stamp in there.items() if self._taken.get(name) != stamp and self._whole(name, stamp, now)
-        ]
+                there[name] = _stamp(os.path.join(self._folder, name))
+        ready = {
+            name: stamp
+            for name, stamp in there.items()
+            if self._taken.get(name) != stamp and self._whole(name, stamp, now)
+        }
         self._seen = {name: seen for name, seen in self._seen.items() if name in there and name not in ready}
-        self._taken = {name: stamp for name, stamp in self._taken.items() if name in there}
-        self._taken.update((name, there[name]) for name in ready)
-        return ready
+        self._taken = {name: stamp for name, stamp in self._taken.items() if name in there} | ready
+        return sorted(ready, key=natural)
 
     def waiting(self) -> bool:
         """Whether something is there that is not whole yet."""
@@ -104,6 +108,6 @@ def hints(folder: Path, arrivals: Arrivals, *, recursive: bool) -> Iterator[Even
         observer.join()
 
 
-def _stamp(path: Path) -> Stamp:
-    found = path.stat()
+def _stamp(path: str) -> Stamp:
+    found = os.stat(path)
     return found.st_size, found.st_mtime_ns

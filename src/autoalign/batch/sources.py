@@ -11,7 +11,9 @@ from pathlib import Path
 
 from autoalign.batch.jobs import Job, JobOptions
 from autoalign.errors import ImageReadError
-from autoalign.files.formats import of_name
+from autoalign.files.formats import FORMATS
+
+EXTENSIONS = frozenset(extension for format in FORMATS for extension in format.extensions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +34,29 @@ def pictures(folder: Path, selection: Selection, *, without: Path | None = None)
     A picture is what has the extension of one; hidden files, and the folder `without`, are passed over. Raises
     ValueError if there are none, ImageReadError if the folder cannot be read.
     """
-    found = found_pictures(folder, selection, without=without)
+    found = sorted(found_pictures(folder, selection, without=without), key=natural)
     if not found:
         raise ValueError(f"has no pictures{' that were asked for' if selection != Selection() else ''}: {folder}")
     return found
 
 
-def found_pictures(folder: Path, selection: Selection, *, without: Path | None = None) -> list[str]:
-    """As `pictures`, but there may be none."""
-    return sorted(_walk(folder, selection, without and without.resolve()), key=natural)
+def found_pictures(folder: Path, selection: Selection, *, without: Path | None = None) -> Iterator[str]:
+    """As `pictures`, but there may be none, and in no particular order."""
+    without = without and without.resolve()
+
+    def refuse(error: OSError) -> None:
+        raise ImageReadError(f"cannot be read ({error.strerror or error}): {error.filename or folder}") from None
+
+    for parent, below, files in os.walk(folder, onerror=refuse, followlinks=True):
+        visible = [name for name in below if selection.recursive and not name.startswith(".")]
+        below[:] = [name for name in visible if Path(parent, name).resolve() != without]
+        inside = Path(parent).relative_to(folder).as_posix()
+        for file in files:
+            # No Path for each: a folder of a hundred thousand is looked at again and again.
+            if not file.startswith(".") and os.path.splitext(file)[1].lower() in EXTENSIONS:
+                name = file if inside == "." else f"{inside}/{file}"
+                if _asked_for(name, selection):
+                    yield name
 
 
 def natural(text: str) -> list[tuple[int, int | str]]:
@@ -94,21 +110,6 @@ def place_of_reference(reference: str, count: int) -> int:
     if reference not in ("first", "middle"):
         raise ValueError(f"the reference of each group is its first or its middle picture, not: {reference}")
     return 0 if reference == "first" else count // 2
-
-
-def _walk(folder: Path, selection: Selection, without: Path | None) -> Iterator[str]:
-    """Every picture that is asked for, in no particular order."""
-
-    def refuse(error: OSError) -> None:
-        raise ImageReadError(f"cannot be read ({error.strerror or error}): {error.filename or folder}") from None
-
-    for parent, below, files in os.walk(folder, onerror=refuse, followlinks=True):
-        visible = [name for name in below if selection.recursive and not name.startswith(".")]
-        below[:] = [name for name in visible if Path(parent, name).resolve() != without]
-        for file in files:
-            name = Path(parent, file).relative_to(folder).as_posix()
-            if not file.startswith(".") and of_name(Path(file)) and _asked_for(name, selection):
-                yield name
 
 
 def _asked_for(name: str, selection: Selection) -> bool:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import signal
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,7 @@ from autoalign.batch.jobs import Job, JobOptions, Recorded
 from autoalign.batch.ledger import Ledger
 from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
 from autoalign.batch.sources import Selection, onto_reference
-from autoalign.batch.telling import write_reports
+from autoalign.batch.telling import Telling, next_turn, write_reports
 from autoalign.cli.progress import tally
 from autoalign.cli.running import RUNNING, Running, engine_of, for_running, in_words, make_folder, upload_reports
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, complain, note, tell
@@ -75,38 +76,48 @@ def watch(
     make_folder(files.out_dir)
     wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
     about = {"watched": str(folder)} | in_words(files, selection, drawing, reading, running, options)
-    engine, counts, reports = engine_of(running), Counter[str](), list[Path]()
-    with (
-        Ledger(files.out_dir) as ledger,
-        feature_store(files.out_dir, running.cache) as store,
-        _until_told(),
-    ):
-        ledger.begin_run(about)
-        note(f"watching {folder}; Ctrl-C ends it", common)
-        for names in _arriving(folder, selection, files):
-            jobs = onto_reference(folder, names, files.reference, files.out_dir, wanted)
-            jobs = for_running(jobs, running)
-            counts.update(_align(jobs, files, ledger, engine, store, common))
-            reports = write_reports(files.out_dir, ledger, about)
+    engine, counts = engine_of(running), Counter[str]()
+    with Ledger(files.out_dir) as ledger, feature_store(files.out_dir, running.cache) as store:
+        telling = Telling(partial(write_reports, files.out_dir, ledger, about))
+        with _until_told():
+            ledger.begin_run(about)
+            note(f"watching {folder}; Ctrl-C ends it", common)
+            for names in _arriving(folder, selection, files, telling.due_s):
+                if names:
+                    telling.expect()
+                    jobs = onto_reference(folder, names, files.reference, files.out_dir, wanted)
+                    counts.update(_align(for_running(jobs, running), files, ledger, engine, store, common))
+                telling.keep_up()
+        reports = telling.finish()
     upload_reports(reports, running)
     tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing new arrived")
     return Exit.DONE if set(counts) <= {"aligned"} else Exit.NOT_ALIGNED
 
 
-def _arriving(folder: Path, selection: Selection, files: WatchFiles) -> Iterator[list[str]]:
-    """The names of pictures, some at a time, as they become whole."""
+def _arriving(
+    folder: Path, selection: Selection, files: WatchFiles, patience_s: Callable[[], float]
+) -> Iterator[list[str]]:
+    """The names of the pictures that each look at the folder finds to have become whole, which may be none.
+
+    There is a look whenever something may have come, and for the caller's sake after `patience_s` at the latest.
+    """
     arrivals = Arrivals(folder, selection, without=files.out_dir)
     idle_since = time.monotonic()
     with hints(folder, arrivals, recursive=selection.recursive) as hint:
         while True:
             hint.clear()  # before the look: what comes during it is seen at the next one
-            if names := arrivals.take():
-                yield names
+            begun = time.monotonic()
+            names = arrivals.take()
+            next_look = next_turn(begun, time.monotonic())
+            yield names
+            if names:
                 idle_since = time.monotonic()
             waiting, idle_s = arrivals.waiting(), time.monotonic() - idle_since
             if files.until_idle is not None and not waiting and idle_s > files.until_idle:
                 return
-            hint.wait(UNSETTLED_S if waiting or files.until_idle is not None else files.rescan)
+            rest_s = UNSETTLED_S if waiting or files.until_idle is not None else files.rescan
+            hint.wait(min(rest_s, patience_s()))
+            time.sleep(max(0.0, next_look - time.monotonic()))
 
 
 def _align(
