@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from autoalign.files.formats import FORMATS
+
 PACKAGE = Path(__file__).parent.parent / "src" / "autoalign"
 
 # Rooms from the ground up: a module may import from lower floors, and from those before it in its own room. Rooms on
@@ -250,6 +252,14 @@ def test_every_home_is_lived_in() -> None:
         for name in homes:
             lived_in = {imported.partition(".")[0] for imported in imports(modules()[name])}
             assert package in lived_in, f"{name} does not import {package} any more"
+
+
+def test_codecs_are_below_the_formats_that_name_them() -> None:
+    places = placed()
+    for format in FORMATS:
+        for function in filter(None, (format.decoder, format.encoder)):
+            module = f"files.{function.partition(':')[0]}"
+            assert places[module] < places["files.formats"], f"{format.name} names {module}, which is not below it"
 
 
 def test_importing_autoalign_loads_nothing_heavy() -> None:

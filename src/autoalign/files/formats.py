@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any, Literal
 
 import numpy as np
 
@@ -31,6 +33,9 @@ class Format:
     grey: bool = True  # False: what is written grey comes back as RGB
     kept: tuple[str, ...]  # of what travels with a picture
     max_side: int = 2**31 - 1  # pixels
+    decoder: str  # module and function that makes its `Decoder`
+    encoder: str | None = None  # the same of its `Encoder`; None where it can only be read
+    told: tuple[Literal["page", "lenient", "quality"], ...] = ()  # what these functions can be told
     extra: str | None = None  # what must be installed on top to read it
     named: bool = False  # the first bytes are not its own, so that the extension must be one of these
 
@@ -58,6 +63,9 @@ JPEG = Format(
     lossy=True,
     alpha=False,
     kept=(EXIF, XMP, ICC, RESOLUTION),
+    decoder="jpeg:decoder",
+    encoder="jpeg:encoder",
+    told=("lenient", "quality"),
     max_side=65_500,
 )
 PNG = Format(
@@ -67,6 +75,9 @@ PNG = Format(
     reads=(np.uint8, np.uint16),
     depths=(np.uint8, np.uint16),
     kept=(EXIF, XMP, ICC, RESOLUTION),
+    decoder="png:decoder",
+    encoder="png:encoder",
+    told=("lenient",),
     max_side=1_000_000,
 )
 TIFF = Format(
@@ -76,6 +87,9 @@ TIFF = Format(
     reads=(np.uint8, np.uint16, np.float32),
     depths=(np.uint8, np.uint16, np.float32),
     kept=(EXIF, XMP, ICC, RESOLUTION, "GeoTIFF", "OME-XML", "ImageJ"),
+    decoder="tiff:decoder",
+    encoder="tiff:encoder",
+    told=("page", "lenient"),
 )
 WEBP = Format(
     name="WebP",
@@ -85,6 +99,8 @@ WEBP = Format(
     depths=(np.uint8,),
     grey=False,
     kept=(EXIF, XMP, ICC, RESOLUTION),
+    decoder="pillow:webp_decoder",
+    encoder="pillow:webp_encoder",
     max_side=16_383,
 )
 BMP = Format(
@@ -95,6 +111,9 @@ BMP = Format(
     depths=(np.uint8,),
     alpha=False,
     kept=(RESOLUTION,),
+    decoder="pillow:bmp_decoder",
+    encoder="pillow:bmp_encoder",
+    told=("lenient",),
 )
 AVIF = Format(
     name="AVIF",
@@ -105,6 +124,8 @@ AVIF = Format(
     lossy=True,
     grey=False,
     kept=(EXIF, XMP, ICC, RESOLUTION),
+    decoder="avif:decoder",
+    encoder="avif:encoder",
     max_side=16_384,
 )
 JPEG_2000 = Format(
@@ -114,6 +135,8 @@ JPEG_2000 = Format(
     reads=(np.uint8, np.uint16),
     depths=(np.uint8, np.uint16),
     kept=(EXIF, XMP, ICC, RESOLUTION),
+    decoder="jpeg2000:decoder",
+    encoder="jpeg2000:encoder",
 )
 JPEG_XL = Format(
     name="JPEG XL",
@@ -122,6 +145,8 @@ JPEG_XL = Format(
     reads=(np.uint8, np.uint16, np.float32),
     depths=(np.uint8, np.uint16, np.float32),
     kept=(EXIF, XMP, RESOLUTION),
+    decoder="jpegxl:decoder",
+    encoder="jpegxl:encoder",
     max_side=2**30,
 )
 HEIC = Format(
@@ -130,6 +155,7 @@ HEIC = Format(
     extensions=(".heic", ".heif"),
     reads=(np.uint8, np.uint16),
     kept=(EXIF, XMP, ICC, RESOLUTION),
+    decoder="heic:decoder",
     extra="heic",
 )
 RAW = Format(
@@ -139,14 +165,12 @@ RAW = Format(
     reads=(np.uint16,),
     alpha=False,
     kept=(EXIF,),
+    decoder="raw:decoder",
     extra="raw",
     named=True,
 )
 FORMATS = (JPEG, PNG, RAW, TIFF, WEBP, BMP, AVIF, JPEG_2000, JPEG_XL, HEIC)
 """In the order in which they are tried: what goes by its name comes before what it looks like."""
-
-LENIENT = (JPEG, PNG, TIFF, BMP)
-"""Formats of which a damaged file has parts that can be read without the others."""
 
 STRANGERS = {
     "GIF": rb"GIF8",
@@ -176,83 +200,22 @@ def of_name(path: Path) -> Format | None:
     return next((format for format in FORMATS if path.suffix.lower() in format.extensions), None)
 
 
-def decoder_for(format: Format, page: int, lenient: bool = False) -> Decoder:
+def decoder_for(format: Format, page: int = 0, lenient: bool = False) -> Decoder:
     """What reads this format; `Refused` for a page other than 0 of a format that has but one.
 
-    `lenient` takes of a damaged file what can be had, if the format is one of `LENIENT`.
+    `lenient` takes of a damaged file what can be had, where the format has parts that can be read without the others.
     """
-    if page != 0 and format is not TIFF:
+    if page != 0 and "page" not in format.told:
         raise Refused(f"is a {format.name} file, which has no page {page} (pages count from 0)")
-    match format.name:
-        case "TIFF":
-            from autoalign.files import tiff
-
-            return tiff.decoder(page, lenient)
-        case "JPEG":
-            from autoalign.files import jpeg
-
-            return jpeg.decoder(lenient)
-        case "PNG":
-            from autoalign.files import png
-
-            return png.decoder(lenient)
-        case "WebP" | "BMP":
-            from autoalign.files import pillow
-
-            return pillow.webp_decoder() if format is WEBP else pillow.bmp_decoder(lenient)
-        case "AVIF":
-            from autoalign.files import avif
-
-            return avif.decoder()
-        case "JPEG 2000":
-            from autoalign.files import jpeg2000
-
-            return jpeg2000.decoder()
-        case "JPEG XL":
-            from autoalign.files import jpegxl
-
-            return jpegxl.decoder()
-        case "HEIC":
-            from autoalign.files import heic
-
-            return heic.decoder()
-        case _:
-            from autoalign.files import raw
-
-            return raw.decoder()
+    decoder: Decoder = _made(format.decoder, format, page=page, lenient=lenient)
+    return decoder
 
 
 def encoder_for(format: Format, jpeg_quality: int) -> Encoder:
     """What writes this format, which must be one that has `depths`."""
-    match format.name:
-        case "TIFF":
-            from autoalign.files import tiff
-
-            return tiff.encoder()
-        case "JPEG":
-            from autoalign.files import jpeg
-
-            return jpeg.encoder(jpeg_quality)
-        case "PNG":
-            from autoalign.files import png
-
-            return png.encoder()
-        case "AVIF":
-            from autoalign.files import avif
-
-            return avif.encoder()
-        case "JPEG 2000":
-            from autoalign.files import jpeg2000
-
-            return jpeg2000.encoder()
-        case "JPEG XL":
-            from autoalign.files import jpegxl
-
-            return jpegxl.encoder()
-        case _:
-            from autoalign.files import pillow
-
-            return pillow.webp_encoder() if format is WEBP else pillow.bmp_encoder()
+    assert format.encoder is not None, format.name
+    encoder: Encoder = _made(format.encoder, format, quality=jpeg_quality)
+    return encoder
 
 
 def table() -> str:
@@ -279,3 +242,9 @@ def default_for(format: Format | None, pixels: Picture | None = None) -> Format:
 def _words(depths: tuple[type, ...]) -> str:
     words: dict[type, str] = {np.uint8: "8", np.uint16: "16", np.float32: "float"}
     return ", ".join(words[depth] for depth in depths)
+
+
+def _made(function: str, format: Format, **words: object) -> Any:
+    """What a function of a codec makes, once it is told those of the words that it knows."""
+    known = {name: value for name, value in words.items() if name in format.told}
+    return resolve_name(f"{__package__}.{function}")(**known)

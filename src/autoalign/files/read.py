@@ -18,7 +18,7 @@ import numpy as np
 
 from autoalign.errors import ImageReadError
 from autoalign.files.codec import Decoder, Header, Refused, one_line
-from autoalign.files.formats import HEAD_BYTES, LENIENT, Format, decoder_for, of_bytes
+from autoalign.files.formats import HEAD_BYTES, Format, decoder_for, of_bytes
 from autoalign.files.metadata import MAX_METADATA, Metadata, describing, turned
 from autoalign.picture.pixels import Picture, size_of
 
@@ -160,7 +160,7 @@ def _decoded(
         except Refused:
             raise
         except Exception as error:  # decoders raise what they like on damaged bytes: struct, zlib, memory, their own
-            if not options.lenient or format not in LENIENT:
+            if not options.lenient or "lenient" not in format.told:
                 raise
             remark = f"is damaged ({one_line(error)}), and what could be read of it was taken"
             return *_decoded_by(decoder_for(format, page, lenient=True), data, max_pixels), remark
