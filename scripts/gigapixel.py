@@ -1,26 +1,28 @@
 """A pair of one gigapixel: is it aligned in bounded memory, how well, and how fast is it drawn?
 
-    python scripts/gigapixel.py [--size 32768 30518] [--channels 3] [--folder DIR]
+    python scripts/gigapixel.py [--size 32768 30518] [--channels 3] [--batch] [--folder DIR]
 
 Two views of one scene are written tile by tile as BigTIFF (a known transform, noise of its own in each), `autoalign
-pair` puts one onto the other in a process of its own, and what that process took at its peak is measured. Then the
-same transform is drawn from the file, strip by strip, with and without writing it, and a part of the picture that fits
-into memory is drawn by one call of `warp`, all in one run: the ratios are what to look at.
+pair` puts one onto the other in a process of its own, and what that process took at its peak is measured; with --batch
+`autoalign batch` does so too, with one worker, and its files must be the same. Then the same transform is drawn from
+the file, strip by strip, with and without writing it, and a part of the picture that fits into memory is drawn by one
+call of `warp`, all in one run: the ratios are what to look at.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import subprocess
+import filecmp
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 import tifffile
 
 from autoalign.files.large import opened_picture
@@ -34,6 +36,7 @@ TILE = 512
 FINE, COARSE = 2048, 2048  # texels of the two textures that the scene is made of
 COARSE_PX = 24  # px a texel of the coarse one, which does not repeat within 49,152 px
 NOISE = 1.5  # grey levels
+POLL_S = 0.02  # between two looks at how much memory is taken
 IN_MEMORY = 8192  # px a side of the part that is drawn in memory
 
 
@@ -118,16 +121,22 @@ def error_px(found: np.ndarray, true: np.ndarray, size: tuple[int, int]) -> floa
     return float(np.linalg.norm(project(found, points)[0] - project(true, points)[0], axis=1).mean())
 
 
-def run_pair(folder: Path) -> tuple[float, float]:
-    """Align the pair in a process of its own: seconds, and GB resident at the peak."""
-    words = ["pair", "fixed.tif", "moving.tif", "-o", "aligned.tif", "--overwrite", "-v"]
-    started = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-m", "autoalign.cli.main", *words], cwd=folder)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
+PAIR = ("pair", "fixed.tif", "moving.tif", "-o", "aligned.tif", "--overwrite", "-v")
+BATCH = ("batch", ".", "--reference", "fixed.tif", "--include", "moving.tif", "--out-dir", "batch", "--workers", "1")
+RESULTS = (("aligned.tif", "moving.tif"), ("aligned.autoalign.json", "moving.tif.autoalign.json"))  # of pair, of batch
+
+
+def run(folder: Path, words: tuple[str, ...]) -> tuple[float, float]:
+    """Align the pair in a process of its own: seconds, and GB resident at the peak of it or of one that it started."""
+    started, peak = time.perf_counter(), 0
+    process = psutil.Popen([sys.executable, "-m", "autoalign.cli.main", *words], cwd=folder)
+    while process.poll() is None:
+        with suppress(psutil.Error):  # one that has just ended
+            peak = max(peak, *(one.memory_info().rss for one in (process, *process.children(recursive=True))))
+        time.sleep(POLL_S)
     if process.returncode:
         raise SystemExit(f"autoalign ended with {process.returncode}")
-    return time.perf_counter() - started, usage.ru_maxrss * 1024 / 1e9
+    return time.perf_counter() - started, peak / 1e9
 
 
 def speeds(folder: Path, fixed_from_moving: np.ndarray, size: tuple[int, int]) -> dict[str, float]:
@@ -155,7 +164,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--size", type=int, nargs=2, default=(32_768, 30_518))
     parser.add_argument("--channels", type=int, choices=(1, 3), default=3)
-    parser.add_argument("--folder", type=Path, default=None, help="in which there is room for 6 GB for a while")
+    parser.add_argument("--batch", action="store_true", help="also align the pair as a batch")
+    parser.add_argument("--folder", type=Path, default=None, help="in which there is room for 8 GB for a while")
     words = parser.parse_args()
     size = (words.size[0], words.size[1])
     with tempfile.TemporaryDirectory(dir=words.folder) as name:
@@ -167,13 +177,17 @@ def main() -> None:
             f"made two pictures of {size[0]} x {size[1]}: {sizes_gb} GB, {time.perf_counter() - started:.0f} s",
             flush=True,
         )
-        seconds, gb = run_pair(folder)
+        seconds, gb = run(folder, PAIR)
         record = read_sidecar(folder / "aligned.autoalign.json")
         error = error_px(transform_of(record), true, size)
         print(f"{record.status}: {error:.3f} px of error, {record.expected_error_px:.3f} expected; ", end="")
         print(
             f"{seconds:.0f} s, {gb:.2f} GB at the peak; output {(folder / 'aligned.tif').stat().st_size / 1e9:.2f} GB"
         )
+        if words.batch:
+            seconds, gb = run(folder, BATCH)
+            same = all(filecmp.cmp(folder / a, folder / "batch" / b, shallow=False) for a, b in RESULTS)
+            print(f"the same as a batch: {seconds:.0f} s, {gb:.2f} GB at the peak; files are equal: {same}", flush=True)
         rates = speeds(folder, true, size)
         for what, rate in rates.items():
             print(f"drawn {what}: {rate:.1f} MP/s, {rate / rates['in memory']:.2f} of that in memory")
