@@ -60,6 +60,7 @@ PLAN = f"""
         attempts = CASE key WHEN excluded.key THEN attempts ELSE 0 END,
         key = excluded.key, fixed = excluded.fixed, moving = excluded.moving, place = excluded.place
 """
+# What became of the job of this name, if that had another key.
 FORGET = f"DELETE FROM result WHERE key = (SELECT key FROM job WHERE name = {TEXT} AND key != ?)"
 KEEP = f"""
     INSERT OR REPLACE INTO result (key, finished, seconds, {", ".join(RESULT)})
