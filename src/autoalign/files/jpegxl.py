@@ -1,6 +1,7 @@
 """JPEG XL: decoding and lossless encoding by imagecodecs (libjxl), metadata in the boxes around the codestream.
 
-The library gives no way to a colour profile, so that one is neither read nor written.
+The library gives no way to a colour profile, so that one is neither read nor written (of the others with wheels, one is
+under the GPL and one knows uint8 alone). Of uint16 and float32 it says in the file that they are linear light.
 """
 
 from __future__ import annotations
