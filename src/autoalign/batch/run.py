@@ -107,6 +107,7 @@ def planned(
     undone = [row.name for row in rows if _is_gone(row, out_dir) or (options.retry and row.status == "failed")]
     ledger.reopen(undone)
     done = {row.name for row in rows}.difference(undone)
+    # Of a job that is new nobody can have left anything, and to list a folder takes longer the more is in it.
     _sweep({os.path.dirname(os.path.join(job.out_dir, job.name)) for job in jobs if job.name in known})
     uses = Counter(path for job in jobs for path in job.inputs)
     again = options.again or frozenset(path for path, count in uses.items() if count > 1)
