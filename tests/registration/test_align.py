@@ -98,11 +98,11 @@ def test_quarter_and_half_turns_are_exact(quarters):
 
 @pytest.mark.parametrize("model", ["translation", "similarity", "homography"])
 def test_there_and_back_is_the_identity(model):
-    """Within 0.01 px on full pictures as the issue has it; twice that on a thirteenth of a megapixel."""
+    """Both ways round the same patches are compared: what is left is the start, and which of them count."""
     of, there = case(model)
     back = align(of.moving, of.fixed)
     loop = Pair(fixed=of.fixed, moving=of.fixed, fixed_from_moving=IDENTITY)
-    assert mean_error_px(there.fixed_from_moving @ back.fixed_from_moving, loop) < 0.02
+    assert mean_error_px(there.fixed_from_moving @ back.fixed_from_moving, loop) < 0.01
 
 
 # What a picture may be

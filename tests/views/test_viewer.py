@@ -101,9 +101,9 @@ def test_patches_are_green_where_the_pictures_are_alike(rejected: Case) -> None:
     recording = rejected.recording
     at, colours = recording.points("/patches/after"), recording.colours("/patches/after", "Points2D").astype(int)
     green = colours[:, 1] > colours[:, 0]
-    # Patches that lie in the caption, and those that do not reach into it.
+    # Patches that lie in the caption whole, and those that do not reach into it.
     reach = rejected.alignment.options.refine.radius + 1
-    below, above = at[:, 1] > 300, at[:, 1] < 300 - reach
+    below, above = at[:, 1] > 300 + reach, at[:, 1] < 300 - reach
     assert green[below].mean() > 0.9
     assert green[above].mean() < 0.1
 
@@ -128,7 +128,9 @@ def test_views(aligned: Case, doubtful: Case, rejected: Case, nothing_found: Cas
     assert names(doubtful) >= common | {matches, "Overlay: the time bar blends"}
     rungs = [attempt.rung for attempt in doubtful.alignment.attempts]
     for step, rung in enumerate(rungs, 1):
-        assert any(name.startswith(f"{step}. {rung}: ") and name.endswith("⚠") for name in doubtful.recording.views)
+        assert any(
+            name.startswith(f"{step}. {rung}: ") and name.endswith("⚠ doubtful") for name in doubtful.recording.views
+        )
     assert names(rejected) >= common | {matches, "Overlay as refused: the time bar blends"}
     assert nothing_found.recording.views == {
         "Fixed | moving: 0 matches, no consensus",

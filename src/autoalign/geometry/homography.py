@@ -113,9 +113,18 @@ def apply(transform: Array, points: ArrayLike) -> Array:
 
 def jacobian(transform: Array, points: Array) -> Array:
     """(n, 2, 2) derivative of the projected position by the position, at (n, 2) points; inf or nan where w is 0."""
-    projected, w = project(transform, points)
+    return np.asarray(project_and_slope(transform, points)[1].transpose(2, 0, 1))
+
+
+def project_and_slope(transform: Array, points: Array) -> tuple[Array, Array]:
+    """Points (n, 2) through one transform, as (2, n), and the derivative there as (2, 2, n), last by the position.
+
+    Points last in memory is what makes sums over them fast.
+    """
+    x, y, w = _project(transform, points)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return (transform[None, :2, :2] - projected[:, :, None] * transform[None, 2:, :2]) / w[:, None, None]
+        slope = [(transform[i, j] - p * transform[2, j]) / w for i, p in ((0, x), (1, y)) for j in (0, 1)]
+    return np.stack([x, y]), np.stack(slope).reshape(2, 2, -1)
 
 
 def transfer_error_squared(dst_from_src: Array, src: Array, dst: Array) -> Array:

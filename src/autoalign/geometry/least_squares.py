@@ -9,14 +9,16 @@ Source: Hartley and Zisserman, 4.3 and appendix 6; iteratively reweighted with T
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from autoalign.geometry.family import Model
-from autoalign.geometry.homography import Array, invert, jacobian, normalisation, project, unit
+from autoalign.geometry.homography import Array, invert, normalisation, project, project_and_slope, unit
 
 TUKEY = 4.685  # 95 % efficiency at a normal distribution
+_CONVERGED = 1e-7  # step, in coordinates where the points are about 1 from their mean: 1e-4 px of any picture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +43,25 @@ class Correspondences:
             dst_sigma=self.dst_sigma[chosen],
         )
 
+    def swapped(self) -> Correspondences:
+        """The same pairs with src for dst."""
+        return Correspondences(src=self.dst, dst=self.src, src_sigma=self.dst_sigma, dst_sigma=self.src_sigma)
+
 
 def correspondences(src: Array, dst: Array, src_sigma: float = 1.0, dst_sigma: float = 1.0) -> Correspondences:
     """Pairs that are all equally good."""
     n = len(src)
     return Correspondences(src=src, dst=dst, src_sigma=np.full(n, src_sigma), dst_sigma=np.full(n, dst_sigma))
+
+
+def joined_pairs(parts: Sequence[Correspondences]) -> Correspondences:
+    """The pairs of all parts, in their order."""
+    return Correspondences(
+        src=np.concatenate([part.src for part in parts]),
+        dst=np.concatenate([part.dst for part in parts]),
+        src_sigma=np.concatenate([part.src_sigma for part in parts]),
+        dst_sigma=np.concatenate([part.dst_sigma for part in parts]),
+    )
 
 
 def velocities(model: Model, points: Array, norm: Array) -> Array:
@@ -54,10 +70,10 @@ def velocities(model: Model, points: Array, norm: Array) -> Array:
     The normalisation is a similarity, which maps every model of the family onto itself; it only conditions the numbers.
     """
     # Points last in memory, (dof, 2, n), is what makes the sums over them fast.
-    scale, g = norm[0, 0], model.generators[..., None]
-    u = points.T * scale + norm[:2, 2:]
-    moved = g[:, :, 0] * u[0] + g[:, :, 1] * u[1] + g[:, :, 2]
-    return np.asarray((moved[:, :2] - u * moved[:, 2:]) / scale).T
+    u = np.ones((3, len(points)))
+    u[:2] = points.T * norm[0, 0] + norm[:2, 2:]
+    moved = np.einsum("gij,jn->gin", model.generators, u)
+    return np.asarray((moved[:, :2] - u[:2] * moved[:, 2:]) / norm[0, 0]).T
 
 
 def step(model: Model, transform: Array, parameters: Array, norm: Array) -> Array:
@@ -93,15 +109,21 @@ class _Linearised:
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")  # points at infinity; polish() looks for them
 def _linearise(model: Model, transform: Array, pairs: Correspondences, norm: Array, src_velocity: Array) -> _Linearised:
-    there, _ = project(transform, pairs.src)
-    back, _ = project(invert(transform), pairs.dst)
-    by_x, by_y = jacobian(transform, pairs.src).T
-    there_slope = by_x * src_velocity[:, :1] + by_y * src_velocity[:, 1:]
-    back_slope = -velocities(model, back, norm).T
+    there, (by_x, by_y) = _forward(transform, pairs)
+    back = project(invert(transform), pairs.dst)[0]
+    slope = np.empty((len(src_velocity), 4, len(pairs)))
+    np.add(by_x * src_velocity[:, :1], by_y * src_velocity[:, 1:], out=slope[:, :2])
+    np.divide(velocities(model, back, norm).T, -pairs.src_sigma, out=slope[:, 2:])
     return _Linearised(
-        residual=np.concatenate([(pairs.dst - there).T / pairs.dst_sigma, (pairs.src - back).T / pairs.src_sigma]),
-        slope=np.concatenate([there_slope / pairs.dst_sigma, back_slope / pairs.src_sigma], axis=1),
+        residual=np.concatenate([(pairs.dst.T - there) / pairs.dst_sigma, (pairs.src - back).T / pairs.src_sigma]),
+        slope=slope,
     )
+
+
+def _forward(transform: Array, pairs: Correspondences) -> tuple[Array, Array]:
+    """Projected src (2, n), and its derivative by x and by y of src (2, 2, n), in sigmas of dst."""
+    there, slope = project_and_slope(transform, pairs.src)
+    return there, (slope / pairs.dst_sigma).swapaxes(0, 1)
 
 
 def robust_scale(error_squared: Array, floor: float) -> float:
@@ -160,6 +182,6 @@ def polish(
                 return transform
             continue
         transform, at, damping = candidate, then, max(damping * 0.1, 1e-9)
-        if np.abs(parameters).max() < 1e-9:
+        if np.abs(parameters).max() < _CONVERGED:
             return transform
     return transform

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from autoalign.geometry.family import MODELS, Model, ModelName, fit
-from autoalign.geometry.homography import Array, symmetric_transfer_error_squared
+from autoalign.geometry.homography import Array, project, symmetric_transfer_error_squared
 from autoalign.geometry.least_squares import Correspondences, polish, robust_scale
 
 _CLIP_SIGMAS = 4.0
@@ -21,11 +21,16 @@ def simplest_model(general: ModelName, dst_from_src: Array, pairs: Correspondenc
     `dst_from_src` is the fitted transform of the general model.
     """
     sigma = robust_scale(_errors(dst_from_src, pairs), 0.01)
+    there, _ = project(dst_from_src, pairs.src)  # where no wrong pair leads the start astray
+    hopeless = 0.5 * _CLIP_SIGMAS**2 * len(pairs)  # half of the pairs denied, where no more than a few may be
     best, chosen = _criterion(MODELS[general], dst_from_src, pairs, sigma), (general, dst_from_src)
     for model in MODELS.values():
         if model.name == general:
             break
-        transform = polish(model, fit(model.name, pairs.src, pairs.dst), pairs, sigma_floor=sigma)
+        transform = fit(model.name, pairs.src, there)
+        if _criterion(model, transform, pairs, sigma) > hopeless:
+            continue
+        transform = polish(model, transform, pairs, sigma_floor=sigma)
         criterion = _criterion(model, transform, pairs, sigma)
         if criterion < best:
             best, chosen = criterion, (model.name, transform)

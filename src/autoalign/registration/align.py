@@ -13,7 +13,7 @@ import numpy as np
 from autoalign.geometry.family import ModelName
 from autoalign.geometry.homography import Mask
 from autoalign.geometry.least_squares import Correspondences
-from autoalign.geometry.ransac import Consensus, ransac
+from autoalign.geometry.ransac import ransac
 from autoalign.geometry.selection import simplest_model
 from autoalign.picture.pixels import Picture
 from autoalign.registration.agreement import agreement
@@ -24,7 +24,7 @@ from autoalign.registration.ladder import Rung, rungs
 from autoalign.registration.matching import Matches, match
 from autoalign.registration.prepared import Pair, Prepared, prepare
 from autoalign.registration.refine import refine
-from autoalign.registration.verdict import Verdict, hints, judge, nothing_found, significant, weigh
+from autoalign.registration.verdict import chance, hints, judge, nothing_found, set_aside, weigh
 
 
 def align(
@@ -44,7 +44,7 @@ def align(
     """
     options = options or AlignOptions()
     pair = Pair(fixed=_prepared(fixed, fixed_valid, "fixed"), moving=_prepared(moving, moving_valid, "moving"))
-    attempts = list(_climb(pair, options))
+    attempts = _climb(pair, options)
     if options.mirror and not any(attempt.verdict.status == "aligned" for attempt in attempts):
         attempts += [unmirrored(attempt, pair.sizes.moving) for attempt in _climb(pair.mirrored(), options)]
     return Alignment(
@@ -64,31 +64,41 @@ def _prepared(picture: Picture | Prepared, valid: Mask | None, name: str) -> Pre
     return picture
 
 
-def _climb(pair: Pair, options: AlignOptions) -> Iterator[Attempt]:
+def _climb(pair: Pair, options: AlignOptions) -> list[Attempt]:
     """Attempts, each harder than the one before, until a verdict is clear or the time is up."""
-    start, least = perf_counter(), np.inf
+    start, attempts = perf_counter(), list[Attempt]()
     for rung in rungs(options.effort, options.detector):
-        if rung.on_a_hint and not hints(least):
+        if rung.on_a_hint and not hints(min((of.log10_false_alarms for of in attempts), default=np.inf)):
             continue
         attempt = _attempt(pair, rung, options)
-        yield attempt
-        log10 = attempt.evidence.log10_false_alarms if attempt.evidence else np.inf
-        least = min(least, log10)
-        if _is_clear(attempt.verdict, log10, rung):
-            return
+        if attempt.log10_false_alarms <= rung.enough_log10:
+            attempt = _concluded(attempt, pair, options)
+        attempts.append(attempt)
+        if _is_clear(attempt, rung):
+            break
         if options.time_limit is not None and perf_counter() - start > options.time_limit:
-            return
+            break
+    return _settled(attempts, pair, options)
 
 
-def _is_clear(verdict: Verdict, log10_false_alarms: float, rung: Rung) -> bool:
+def _settled(attempts: list[Attempt], pair: Pair, options: AlignOptions) -> list[Attempt]:
+    """The attempts, of which the most telling are concluded, one after the other until one is aligned."""
+    settled = list(attempts)
+    for i in sorted(range(len(attempts)), key=lambda i: attempts[i].log10_false_alarms):
+        settled[i] = _concluded(attempts[i], pair, options)
+        if settled[i].verdict.status == "aligned":
+            break
+    return settled
+
+
+def _is_clear(attempt: Attempt, rung: Rung) -> bool:
     """Whether no harder attempt could tell more: aligned, precise enough, and on more than a thin consensus."""
-    error = verdict.expected_error_px
-    precise = error is not None and error <= rung.enough_px
-    return verdict.status == "aligned" and precise and log10_false_alarms <= rung.enough_log10
+    error = attempt.verdict.expected_error_px
+    return attempt.verdict.status == "aligned" and error is not None and error <= rung.enough_px
 
 
 def _attempt(pair: Pair, rung: Rung, options: AlignOptions) -> Attempt:
-    """One rung: every stage in turn."""
+    """One rung, as far as its consensus."""
     seconds: dict[str, float] = {}
     with _timed(seconds, "detect"):
         fixed_features, moving_features = _detect_both(pair, rung)
@@ -103,26 +113,38 @@ def _attempt(pair: Pair, rung: Rung, options: AlignOptions) -> Attempt:
         moving_features=moving_features,
         matches=matches,
         pairs=pairs,
-        consensus=consensus,
         verdict=nothing_found(len(pairs)),
         seconds=seconds,
     )
-    return attempt if consensus is None else _concluded(attempt, consensus, pair, options)
+    if consensus is None:
+        return attempt
+    known = chance(pairs, consensus, pair.sizes)
+    return replace(
+        attempt,
+        consensus=consensus,
+        chance=known,
+        model=consensus.model,
+        fixed_from_moving=consensus.dst_from_src,
+        verdict=set_aside(known),
+    )
 
 
-def _concluded(attempt: Attempt, consensus: Consensus, pair: Pair, options: AlignOptions) -> Attempt:
-    """The attempt with its consensus refined and judged."""
-    with _timed(attempt.seconds, "refine"):
-        sharp = significant(attempt.pairs, consensus, pair.sizes, options.verdict)
+def _concluded(attempt: Attempt, pair: Pair, options: AlignOptions) -> Attempt:
+    """The attempt with its consensus, if there is one, refined and judged."""
+    consensus, known, seconds = attempt.consensus, attempt.chance, dict(attempt.seconds)
+    if consensus is None or known is None or not attempt.is_set_aside:
+        return attempt
+    with _timed(seconds, "refine"):
+        lucky = known.log10_false_alarms > options.verdict.max_log10_false_alarms
         refinement = refine(
-            pair.fixed.grey, pair.moving.grey, consensus, attempt.pairs, options.refine, pair.masks, skip=not sharp
+            pair.fixed.grey, pair.moving.grey, consensus, attempt.pairs, options.refine, pair.masks, skip=lucky
         )
         model, transform = consensus.model, refinement.fixed_from_moving
         if options.model == "auto":
             model, transform = simplest_model(model, transform, refinement.pairs)
-    with _timed(attempt.seconds, "verdict"):
+    with _timed(seconds, "verdict"):
         agreed = agreement(pair.fixed.grey_8_bit, pair.moving.grey_8_bit, transform, *pair.masks)
-        evidence = weigh(model, transform, attempt.pairs, consensus, refinement.pairs, agreed, pair.sizes)
+        evidence = weigh(model, transform, refinement.pairs, known, agreed, pair.sizes)
         verdict = judge(evidence, options.verdict, pair.sizes)
     return replace(
         attempt,
@@ -131,6 +153,7 @@ def _concluded(attempt: Attempt, consensus: Consensus, pair: Pair, options: Alig
         fixed_from_moving=transform,
         evidence=evidence,
         verdict=verdict,
+        seconds=seconds,
     )
 
 
@@ -159,7 +182,7 @@ def _general(choice: ModelChoice) -> ModelName:
 def _rank(attempt: Attempt) -> tuple[int, float]:
     """Better verdicts first, then the consensus that is less probable by chance."""
     order = {"aligned": 2, "doubtful": 1, "rejected": 0}
-    return order[attempt.verdict.status], -attempt.evidence.log10_false_alarms if attempt.evidence else -np.inf
+    return order[attempt.verdict.status], -attempt.log10_false_alarms
 
 
 @contextmanager

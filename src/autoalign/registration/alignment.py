@@ -17,7 +17,7 @@ from autoalign.registration.features import Features
 from autoalign.registration.ladder import Effort
 from autoalign.registration.matching import Matches
 from autoalign.registration.refine import Refinement, RefineOptions
-from autoalign.registration.verdict import Evidence, Status, Verdict, VerdictOptions
+from autoalign.registration.verdict import Chance, Evidence, Status, Verdict, VerdictOptions
 
 if TYPE_CHECKING:
     from skimage.transform import ProjectiveTransform
@@ -56,11 +56,22 @@ class Attempt:
     moving_features: Features | None = None
     matches: Matches | None = None
     consensus: Consensus | None = None
-    refinement: Refinement | None = None
+    chance: Chance | None = None  # of the consensus
+    refinement: Refinement | None = None  # None also where the attempt was set aside for one that found more
     model: ModelName | None = None
     fixed_from_moving: Array | None = None  # (3, 3) of unit norm: the refinement's, in its simplest model
     evidence: Evidence | None = None
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
+
+    @property
+    def log10_false_alarms(self) -> float:
+        """How often random matches agree as well, as a logarithm; inf where none do."""
+        return self.chance.log10_false_alarms if self.chance else float("inf")
+
+    @property
+    def is_set_aside(self) -> bool:
+        """Whether its consensus was neither refined nor judged, because another attempt found more."""
+        return self.consensus is not None and self.evidence is None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ Detector = Literal["orb", "sift"]
 DETECTORS: tuple[Detector, ...] = get_args(Detector)
 
 _ORB_STEP = 1.2  # from one pyramid level of ORB to the next
-_SIFT_NORM = 4000.0  # a RootSIFT descriptor of this length, rounded: its scalar products stay under 2**24
+_SIFT_NORM = 2800.0  # a RootSIFT descriptor of this length, rounded: squared distances of two stay under 2**24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class Features:
     sizes: Array  # (n,) diameter of the described patch, px of the full picture
     angles: Array  # (n,) orientation, radians
     sigmas: Array  # (n,) expected error of a point, px of the full picture
-    descriptors: NDArray[np.float32]  # (n, d) whole numbers whose scalar products are exact in float32
+    descriptors: NDArray[np.float32]  # (n, d) whole numbers whose squared distances are exact in float32
     detector: Detector
 
     def __len__(self) -> int:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from autoalign.geometry.homography import Array, Mask, invert, jacobian, project, translation
 from autoalign.geometry.least_squares import Correspondences
-from autoalign.picture.pixels import Picture, PixelSource, Shrunken, grey, opaque, size_of, to_8_bit
+from autoalign.picture.pixels import PixelSource, Shrunken, grey, opaque, size_of, to_8_bit
 from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment, AlignOptions, Attempt
 from autoalign.registration.frames import in_pixels_of
-from autoalign.registration.patches import RIM, Comparison, compare
+from autoalign.registration.patches import RIM, Comparison, Manner, compare_as, joined
 from autoalign.registration.refine import Look, follow, in_grey_levels, pyramid
 from autoalign.registration.verdict import Sizes, judge, weigh
 
@@ -68,12 +68,10 @@ def align_large(
 
 def _judged(attempt: Attempt, options: AlignOptions, sizes: Sizes) -> Attempt:
     """The attempt with the evidence and the verdict that its numbers give in full pixels."""
-    found, refined, before = attempt.consensus, attempt.refinement, attempt.evidence
-    if found is None or refined is None or before is None or attempt.model is None or attempt.fixed_from_moving is None:
+    refined, before = attempt.refinement, attempt.evidence
+    if refined is None or before is None or attempt.model is None or attempt.fixed_from_moving is None:
         return attempt
-    evidence = weigh(
-        attempt.model, attempt.fixed_from_moving, attempt.pairs, found, refined.pairs, before.agreement, sizes
-    )
+    evidence = weigh(attempt.model, attempt.fixed_from_moving, refined.pairs, before, before.agreement, sizes)
     return replace(attempt, evidence=evidence, verdict=judge(evidence, options.verdict, sizes))
 
 
@@ -182,28 +180,10 @@ def _levels(window: Shrunken, finest: int, coarser: int) -> list[Shrunken]:
 def _look_at(samples: Sequence[_Sample], level: int, radius: int) -> Look:
     """How the samples are compared at one level, from the coarsest."""
 
-    def look(transform: Array, chosen: NDArray[np.intp], cubic: bool) -> Comparison:
+    def look(transform: Array, chosen: NDArray[np.intp], manner: Manner) -> Comparison:
         some = [samples[i] for i in chosen.tolist()]
-        return _joined(
-            [compare(of.fixed[level], of.moving[level], transform, of.place, radius, cubic=cubic) for of in some]
+        return joined(
+            [compare_as(manner, of.fixed[level], of.moving[level], transform, of.place, radius) for of in some]
         )
 
     return look
-
-
-def _joined(parts: Sequence[Comparison]) -> Comparison:
-    def all_of(arrays: Sequence[NDArray[np.generic]]) -> Picture:
-        return np.concatenate(arrays)
-
-    pairs = [part.pairs for part in parts]
-    return Comparison(
-        pairs=Correspondences(
-            src=all_of([of.src for of in pairs]),
-            dst=all_of([of.dst for of in pairs]),
-            src_sigma=all_of([of.src_sigma for of in pairs]),
-            dst_sigma=all_of([of.dst_sigma for of in pairs]),
-        ),
-        shift=all_of([part.shift for part in parts]),
-        correlation=all_of([part.correlation for part in parts]),
-        inside=all_of([part.inside for part in parts]),
-    )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from autoalign.geometry.homography import Array
 from autoalign.registration.features import Features
 
-_ROWS = 1024  # descriptors compared at a time
+_ROWS = 512  # descriptors compared at a time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,10 +73,12 @@ def _nearest(
     n = len(descriptors)
     index, near, rival = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
     least = np.full(len(others), np.inf, np.float32)
-    lengths = (others.descriptors * others.descriptors).sum(1)
+    # |a - b|^2 = (a, |a|^2, 1) . (-2 b, 1, |b|^2): one product, every partial sum of which is exact.
+    columns = np.column_stack([-2 * others.descriptors, _ones(len(others)), _lengths(others.descriptors)])
     for start in range(0, n, _ROWS):  # blocks of rows bound the memory
         rows = slice(start, start + _ROWS)
-        distance = _squared_distances(descriptors[rows], others.descriptors, lengths)
+        part = descriptors[rows]
+        distance = np.column_stack([part, _lengths(part), _ones(len(part))]) @ columns.T
         np.minimum(least, distance.min(0), out=least)
         index[rows] = distance.argmin(1)
         near[rows] = distance[np.arange(len(distance)), index[rows]]
@@ -84,15 +86,13 @@ def _nearest(
     return index, near, rival, least
 
 
-def _squared_distances(
-    a: NDArray[np.float32], b: NDArray[np.float32], b_lengths: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """(n, m) squared Euclidean distances of (n, d) and (m, d), whose own squared lengths (m,) are known."""
-    product = a @ b.T
-    product *= -2
-    product += (a * a).sum(1)[:, None]
-    product += b_lengths
-    return np.asarray(np.maximum(product, 0, out=product))
+def _lengths(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n,) squared Euclidean lengths of (n, d)."""
+    return np.asarray((descriptors * descriptors).sum(1))
+
+
+def _ones(n: int) -> NDArray[np.float32]:
+    return np.ones(n, np.float32)
 
 
 def _second(
@@ -106,13 +106,14 @@ def _second(
     distance[rows, nearest] = np.inf
     rival = np.empty(len(distance), np.float32)
     reach = (apart * others.sizes[nearest]) ** 2
+    second = distance.argmin(1)
     while len(rows):
-        second = distance[rows].argmin(1)
         rival[rows] = distance[rows, second]
         gap = ((others.points[second] - others.points[nearest[rows]]) ** 2).sum(1)
         twin = (gap < reach[rows]) & np.isfinite(rival[rows])
         rows, second = rows[twin], second[twin]
         distance[rows, second] = np.inf
+        second = distance[rows].argmin(1)
     return rival
 
 

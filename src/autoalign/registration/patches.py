@@ -13,7 +13,9 @@ Sources: Gruen 1985 (least-squares matching); Lucas and Kanade 1981; Benhimane a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,7 +23,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from autoalign.geometry.homography import Array, Mask, apply, invert, jacobian, project, unit
-from autoalign.geometry.least_squares import Correspondences
+from autoalign.geometry.least_squares import Correspondences, joined_pairs
 from autoalign.picture.pixels import Picture, Shrunken, size_of
 
 RIM = 2  # px around a patch that its comparison needs: one for the gradients, one for the smoothing
@@ -29,6 +31,9 @@ _SMOOTHING = 0.6  # px; takes away what bilinear sampling would distort (measure
 _STRETCH = 4.0  # times that a patch may be longer in the moving picture; beyond, its pixels are too far apart
 _AT_ONCE = 128  # patches; what is computed on so many stays in the processor's cache
 _REMAP_LIMIT = 32_767  # px, the longest side that cv2.remap takes
+
+Manner = Literal["rough", "fine", "both ways"]
+"""With bilinear or cubic interpolation of the moving picture, or with cubic interpolation of each in turn."""
 
 _Float = NDArray[np.float32]
 _Index = NDArray[np.intp]
@@ -39,9 +44,56 @@ class Comparison:
     """All patches compared under one transform."""
 
     pairs: Correspondences  # (n) src: where the patch is in moving, dst: where it is in fixed, full px
-    shift: Array  # (n, 2) how far it wants to move, px of the compared pictures
+    shift: Array  # (n, 2) how far it wants to move, px of the compared pictures; both ways: at most, along x and y
     correlation: Array  # (n,) -1 where it lies outside
     inside: Mask  # (n,) lies in both pictures
+
+
+def joined(parts: Sequence[Comparison]) -> Comparison:
+    """All patches of several comparisons, in their order."""
+    return Comparison(
+        pairs=joined_pairs([part.pairs for part in parts]),
+        shift=np.concatenate([part.shift for part in parts]),
+        correlation=np.concatenate([part.correlation for part in parts]),
+        inside=np.concatenate([part.inside for part in parts]),
+    )
+
+
+def compare_both_ways(
+    fixed: Shrunken, moving: Shrunken, fixed_from_moving: Array, places: Array, radius: int
+) -> Comparison:
+    """As `compare`, cubic: each patch is laid on the fixed picture's pixels, then on the moving one's, and the mean of
+    both is taken. What interpolation does to either picture is lost in it, and the answer is that of swapped roles."""
+    moving_from_fixed = invert(fixed_from_moving)
+    there = compare(fixed, moving, fixed_from_moving, places, radius, cubic=True)
+    back = compare(moving, fixed, moving_from_fixed, apply(moving_from_fixed, places), radius, cubic=True)
+    inside = there.inside & back.inside
+    return Comparison(
+        pairs=_mean(there.pairs, back.pairs.swapped()),
+        shift=np.maximum(np.abs(there.shift), np.abs(back.shift)),
+        correlation=np.where(inside, (there.correlation + back.correlation) / 2, -1.0),
+        inside=inside,
+    )
+
+
+def _mean(a: Correspondences, b: Correspondences) -> Correspondences:
+    """Two sets of the same pairs as one. They lie within a pixel of each other, where a transform is as good as affine:
+    the residual of a mean is the mean of the residuals. Both see the same noise, so that it is no smaller."""
+    return Correspondences(
+        src=(a.src + b.src) / 2,
+        dst=(a.dst + b.dst) / 2,
+        src_sigma=(a.src_sigma + b.src_sigma) / 2,
+        dst_sigma=(a.dst_sigma + b.dst_sigma) / 2,
+    )
+
+
+def compare_as(
+    manner: Manner, fixed: Shrunken, moving: Shrunken, fixed_from_moving: Array, places: Array, radius: int
+) -> Comparison:
+    """Compare in one of the manners."""
+    if manner == "both ways":
+        return compare_both_ways(fixed, moving, fixed_from_moving, places, radius)
+    return compare(fixed, moving, fixed_from_moving, places, radius, cubic=manner == "fine")
 
 
 def compare(

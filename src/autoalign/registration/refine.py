@@ -1,10 +1,11 @@
 """Consensus -> sub-pixel transform with its uncertainty, by least-squares matching of patches at full resolution.
 
-Patches around corners of the fixed picture are compared with the moving picture seen through the current transform.
-One Gauss-Newton step per patch says how far it is off, robust least squares over all patches moves the transform, and
-the patches are sampled again, first on halved pictures, then on the full ones.
+Patches around corners of one picture are compared with the other picture seen through the current transform. One
+Gauss-Newton step per patch says how far it is off, robust least squares over all patches moves the transform, and the
+patches are sampled again, first on halved pictures, then on the full ones, at last from both pictures' point of view.
 
-A part of the patches takes no part in the fit and decides whether it helped, and the keypoints must not deny it.
+A part of the patches takes no part in the fit until it has decided whether it helped, and the keypoints must not deny
+it.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ from autoalign.geometry.homography import (
     jacobian,
     project,
     symmetric_transfer_error_squared,
+    unit,
 )
 from autoalign.geometry.least_squares import Correspondences, polish
 from autoalign.geometry.ransac import Consensus
+from autoalign.geometry.uncertainty import overlap_share
 from autoalign.picture.pixels import Picture, Shrunken, halve, size_of, to_8_bit
-from autoalign.registration.patches import RIM, Comparison, compare
+from autoalign.registration.patches import RIM, Comparison, Manner, compare_as
 
 _COMMON_BIAS = 0.25  # sigmas that all keypoints may be off together: ORB's corners are whole pixels
 _FEW = 300  # patches; where there is no room for so many side by side, they may overlap more
@@ -40,15 +43,19 @@ _LAST_STEPS = 30  # and when none will
 _HELD_OUT = 5  # every fifth patch judges
 
 
-Look = Callable[[Array, NDArray[np.intp], bool], Comparison]
-"""Patches compared at one resolution: under a transform, those of these numbers, with cubic interpolation or not."""
+Look = Callable[[Array, NDArray[np.intp], Manner], Comparison]
+"""Patches compared at one resolution: under a transform, those of these numbers, with bilinear or cubic interpolation
+of the moving picture, or with cubic interpolation of each in turn."""
+
+
+_Round = tuple[Look, NDArray[np.intp], Manner]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineOptions:
     """How the transform is sharpened on the pixels."""
 
-    patches: int = 1500
+    patches: int = 1000
     """patches compared, at most; 0 leaves the transform of the keypoints as it is"""
     radius: int = 12
     """a patch is 2 x radius + 1 pixels wide"""
@@ -103,12 +110,9 @@ def refine(
     transform = consensus.dst_from_src
     fixed, moving = in_grey_levels(fixed), in_grey_levels(moving)
     levels = _levels(fixed, moving, transform, consensus, matched)
-    finest = levels[-1]
-    level_px = finest.fixed.full_from_small[0, 0], finest.moving.full_from_small[0, 0]
-    clear = [_clear(mask, (options.radius + RIM) * px) for mask, px in zip(masks, level_px, strict=True)]
-    corners = _corners(fixed, transform, size_of(moving), options, (clear[0], clear[1]))
-    looks = [_look_at(level, corners, options.radius) for level in levels]
-    return follow(looks, len(corners), consensus, matched, options)
+    places = _places(levels[-1], transform, options, masks)
+    looks = [_look_at(level, places, options.radius) for level in levels]
+    return follow(looks, len(places), consensus, matched, options)
 
 
 def follow(
@@ -126,19 +130,21 @@ def follow(
     judges, leaders = everyone[::_HELD_OUT], everyone[everyone % _HELD_OUT != 0]
     # A few hundred patches lead the way; all of them, and the dearer interpolation, are for the last step.
     scouts = leaders[:: max(1, count // _SCOUTS)]
-    rounds = [(look, scouts, False) for look in [looks[0], *looks]] + [(finest, everyone, True)] * options.rounds
-    for look, chosen, cubic in rounds:
-        seen = look(transform, chosen, cubic)
+    scouting: list[_Round] = [(look, scouts, "rough") for look in [looks[0], *looks]]
+    everywhere: list[_Round] = [(finest, everyone, "both ways")] * options.rounds
+    for look, chosen, manner in scouting + everywhere:
+        seen = look(transform, chosen, manner)
         used = _usable(seen, options) & np.isin(chosen, leaders)
-        moved = _fit(model, transform, seen, used, _LAST_STEPS if cubic else _LEADING_STEPS)
+        moved = _fit(model, transform, seen, used, _LEADING_STEPS if manner == "rough" else _LAST_STEPS)
         if moved is None:
             return unchanged
         transform = moved
-    before = finest(consensus.dst_from_src, everyone, True)
-    judged = finest(transform, judges, True)
-    after = seen.correlation
+    before = finest(consensus.dst_from_src, everyone, "fine")
+    judged = finest(transform, judges, "fine")
+    kept, after = _usable(seen, options), seen.correlation.copy()
     after[judges] = judged.correlation
-    patches = Patches(pairs=seen.pairs, before=before.correlation, after=after, kept=_usable(seen, options))
+    patches = Patches(pairs=seen.pairs, before=before.correlation, after=after, kept=kept)
+    transform = polish(model, transform, seen.pairs[kept], sigma_floor=0.02)  # the judges, too, know something
     if not _helped(before.correlation[judges], after[judges]) or _contradicts(model, consensus, transform, matched):
         return Refinement(
             fixed_from_moving=consensus.dst_from_src, pairs=unchanged.pairs, patches=patches, sharpened=False
@@ -167,11 +173,11 @@ class _Level:
     moving: Shrunken
 
 
-def _look_at(level: _Level, corners: Array, radius: int) -> Look:
-    """How the patches around `corners` (n, 2) of the full fixed picture are compared at one level."""
+def _look_at(level: _Level, places: Array, radius: int) -> Look:
+    """How the patches around `places` (n, 2) of the full fixed picture are compared at one level."""
 
-    def look(transform: Array, chosen: NDArray[np.intp], cubic: bool) -> Comparison:
-        return compare(level.fixed, level.moving, transform, corners[chosen], radius, cubic=cubic)
+    def look(transform: Array, chosen: NDArray[np.intp], manner: Manner) -> Comparison:
+        return compare_as(manner, level.fixed, level.moving, transform, places[chosen], radius)
 
     return look
 
@@ -206,32 +212,56 @@ def _clear(mask: Mask | None, reach_px: float) -> Mask | None:
     return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
+def _places(
+    level: _Level, fixed_from_moving: Array, options: RefineOptions, masks: tuple[Mask | None, Mask | None]
+) -> Array:
+    """(n, 2) what patches are laid around, full px of the fixed picture: corners, the strongest first."""
+    reach = options.radius + RIM
+    clear_fixed, clear_moving = (
+        _clear(mask, reach * of.full_from_small[0, 0])
+        for mask, of in zip(masks, (level.fixed, level.moving), strict=True)
+    )
+    in_fixed = _corners(level.fixed, level.moving, invert(fixed_from_moving), options, (clear_fixed, clear_moving))
+    in_moving = _corners(level.moving, level.fixed, fixed_from_moving, options, (clear_moving, clear_fixed))
+    # What the picture with fewer corners shows, the other shows too; and they are the same for swapped roles.
+    places = in_fixed if len(in_fixed) <= len(in_moving) else project(fixed_from_moving, in_moving)[0]
+    return places[: options.patches]
+
+
 def _corners(
-    fixed: Picture,
-    transform: Array,
-    moving_size: tuple[int, int],
+    picture: Shrunken,
+    other: Shrunken,
+    other_from_picture: Array,
     options: RefineOptions,
     masks: tuple[Mask | None, Mask | None],
 ) -> Array:
-    """(n, 2) corners of the fixed picture, spread, whose patches lie in both pictures."""
-    halvings = max(0, int(np.ceil(np.log2(fixed.size / _CORNER_PIXELS) / 2)))
-    small = pyramid(fixed, halvings, 0)[0]
-    w, h = size_of(small.pixels)
+    """(n, 2) corners of one picture that lie in the other too, apart from each other, full px.
+
+    The transform is between the full pictures; `masks`, of this picture and the other, are True where a patch may lie.
+    """
+    halvings = max(0, int(np.ceil(np.log2(picture.pixels.size / _CORNER_PIXELS) / 2)))
+    small = pyramid(picture.pixels, halvings, 0)[0]
+    full_from_small = picture.full_from_small @ small.full_from_small
+    size = size_of(small.pixels)
+    other_from_small = unit(invert(other.full_from_small) @ other_from_picture @ full_from_small)
+    share = overlap_share(invert(other_from_small), size_of(other.pixels), size)
     # Patches nearer than their radius see the same noise, and would be counted as if they did not.
-    spread, scarce = (np.sqrt(w * h / count) * 0.6 for count in (options.patches, _FEW))
+    spread, scarce = (0.6 * np.sqrt(share * small.pixels.size / count) for count in (options.patches, _FEW))
     apart = max(4.0, spread, min(options.radius / small.full_from_small[0, 0], scarce))
-    usable, moving_usable = masks
-    mask = None if usable is None else cv2.resize(usable.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
-    found = cv2.goodFeaturesToTrack(to_8_bit(small.pixels), 3 * options.patches, 0.003, apart, mask=mask, blockSize=7)
+    usable, usable_there = masks
+    mask = None if usable is None else cv2.resize(usable.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    most = round(3 * options.patches / max(share, 0.01))
+    found = cv2.goodFeaturesToTrack(to_8_bit(small.pixels), most, 0.003, apart, mask=mask, blockSize=7)
     if found is None:
         return np.zeros((0, 2))
-    points = apply(small.full_from_small, found.reshape(-1, 2))
-    there, w_there = project(invert(transform), points)
-    inside = (w_there > 0) & (there > 0).all(1) & (there < np.array(moving_size) - 1).all(1)
-    if moving_usable is not None:
+    points = apply(full_from_small, found.reshape(-1, 2))
+    there, w_there = project(other_from_picture, points)
+    far_end = apply(other.full_from_small, np.array([size_of(other.pixels)]) - 1)
+    inside = (w_there > 0) & (there > 0).all(1) & (there < far_end).all(1)
+    if usable_there is not None:
         column, row = np.rint(there[inside]).astype(int).T
-        inside[inside] = moving_usable[row, column]
-    return points[inside][: options.patches]
+        inside[inside] = usable_there[row, column]
+    return points[inside]
 
 
 def _usable(seen: Comparison, options: RefineOptions) -> Mask:

@@ -60,13 +60,19 @@ class VerdictOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evidence:
-    """All that the verdict rests on, in numbers."""
+class Chance:
+    """Whether random matches could agree as well."""
 
     matches: int
     independent_matches: int  # at most one to a spot of either picture
     independent_inliers: int
     log10_false_alarms: float  # of the independent inliers
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence(Chance):
+    """All that the verdict rests on, in numbers."""
+
     overlap: float  # share of the fixed picture that is covered
     agreement: Agreement
     stretch: tuple[float, float]  # least and greatest scale over the overlap, fixed px per moving px
@@ -94,42 +100,42 @@ class Sizes:
     moving: tuple[int, int]
 
 
-def significant(pairs: Correspondences, consensus: Consensus, sizes: Sizes, options: VerdictOptions) -> bool:
-    """Whether the consensus is more than what random matches give."""
-    return _log10_false_alarms(pairs[_independent(pairs)], consensus, sizes) <= options.max_log10_false_alarms
+def chance(pairs: Correspondences, consensus: Consensus, sizes: Sizes) -> Chance:
+    """How telling a consensus is; `pairs` are all matches, src moving, dst fixed, the subject of `consensus`."""
+    alone = _independent(pairs)
+    independent = pairs[alone]
+    chances = _chances(consensus.dst_from_src, independent, sizes.moving, sizes.fixed)
+    return Chance(
+        matches=len(pairs),
+        independent_matches=len(independent),
+        independent_inliers=int(consensus.inliers[alone].sum()),
+        log10_false_alarms=log10_false_alarms(chances, MODELS[consensus.model].sample_size)[0],
+    )
 
 
 def weigh(
-    model: ModelName,
-    transform: Array,
-    pairs: Correspondences,
-    consensus: Consensus,
-    fitted: Correspondences,
-    agreed: Agreement,
-    sizes: Sizes,
+    model: ModelName, transform: Array, fitted: Correspondences, known: Chance, agreed: Agreement, sizes: Sizes
 ) -> Evidence:
     """Collect the evidence for a transform of the model `model`, fixed from moving.
 
-    `pairs` are all matches, src moving, dst fixed, the subject of `consensus`; `fitted` are those, or patches, that the
-    transform was fitted to in the end; `agreed` is what the pixels say.
+    `fitted` are the matches or patches that the transform was fitted to in the end, src moving, dst fixed; `known` is
+    what tells the consensus from chance, `agreed` what the pixels say.
     """
-    alone = _independent(pairs)
-    independent, near = pairs[alone], consensus.inliers[alone]
     overlap = overlap_points(transform, sizes.moving, sizes.fixed)
-    known = uncertainty(MODELS[model], transform, fitted)
+    spread = uncertainty(MODELS[model], transform, fitted)
     stretch, anisotropy = _shape(transform, overlap)
     return Evidence(
-        matches=len(pairs),
-        independent_matches=len(independent),
-        independent_inliers=int(near.sum()),
-        log10_false_alarms=_log10_false_alarms(independent, consensus, sizes),
+        matches=known.matches,
+        independent_matches=known.independent_matches,
+        independent_inliers=known.independent_inliers,
+        log10_false_alarms=known.log10_false_alarms,
         overlap=overlap_share(transform, sizes.moving, sizes.fixed),
         agreement=agreed,
         stretch=stretch,
         anisotropy=anisotropy,
         halves_px=_halves(MODELS[model], transform, fitted, overlap),
-        fit_px=_root_mean_square(point_errors(MODELS[model], transform, known, overlap)),
-        model_px=known.model_px,
+        fit_px=_root_mean_square(point_errors(MODELS[model], transform, spread, overlap)),
+        model_px=spread.model_px,
     )
 
 
@@ -141,11 +147,6 @@ def _independent(pairs: Correspondences) -> NDArray[np.int64]:
     """Indices of the matches that repeat no better one's spot, in either picture."""
     by_dst = first_in_each_cell(pairs.dst / pairs.dst_sigma.mean(), _SPOT_SIGMAS)
     return np.asarray(by_dst[first_in_each_cell(pairs.src[by_dst] / pairs.src_sigma.mean(), _SPOT_SIGMAS)])
-
-
-def _log10_false_alarms(independent: Correspondences, consensus: Consensus, sizes: Sizes) -> float:
-    chances = _chances(consensus.dst_from_src, independent, sizes.moving, sizes.fixed)
-    return log10_false_alarms(chances, MODELS[consensus.model].sample_size)[0]
 
 
 def _chances(transform: Array, pairs: Correspondences, src_size: tuple[int, int], dst_size: tuple[int, int]) -> Array:
@@ -220,6 +221,16 @@ def nothing_found(matches: int) -> Verdict:
     )
 
 
+def set_aside(known: Chance) -> Verdict:
+    """The verdict on a consensus that was not looked into, because another one says more."""
+    return Verdict(
+        status="doubtful",
+        reason=f"{_agree(known)} ({_chance(known.log10_false_alarms)} by chance); another attempt found more",
+        advice="",
+        expected_error_px=None,
+    )
+
+
 def judge(evidence: Evidence, options: VerdictOptions, sizes: Sizes) -> Verdict:
     """The verdict on the evidence."""
     for failed, advice in _rejections(evidence, options):
@@ -230,7 +241,7 @@ def judge(evidence: Evidence, options: VerdictOptions, sizes: Sizes) -> Verdict:
     return Verdict(status="aligned", reason=_praise(evidence), advice="", expected_error_px=error)
 
 
-def _agree(evidence: Evidence) -> str:
+def _agree(evidence: Chance) -> str:
     return f"{evidence.independent_inliers} of {evidence.independent_matches} independent matches agree"
 
 

@@ -46,7 +46,7 @@ from autoalign.views.evidence import (
     residual_histogram,
 )
 from autoalign.views.pictures import Encoded, Layers, Shown, as_shown, layers, original_bytes
-from autoalign.views.words import MARK_OF, checks, found_by, plain, report
+from autoalign.views.words import MARK_OF, checks, found_by, outcome, plain, report
 
 APPLICATION = "autoalign"
 MAGNIFIED = 20  # times that residuals are drawn
@@ -450,7 +450,7 @@ def _rung_views(scene: _Scene) -> list[rrb.Grid]:
     """One small picture of the matches for every rung that was climbed, in one tab."""
     views = [
         _view(
-            f"{step}. {attempt.rung}: {found_by(attempt)} {MARK_OF[attempt.verdict.status]}",
+            f"{step}. {attempt.rung}: {found_by(attempt)}, {outcome(attempt)}",
             [*_PICTURES, f"/rungs/{step}/**"],
             _both(scene),
             _PICTURES,

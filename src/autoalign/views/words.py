@@ -160,6 +160,11 @@ def found_by(attempt: Attempt) -> str:
     return f"{attempt.consensus.count:,} of {len(attempt.pairs):,} matches agree"
 
 
+def outcome(attempt: Attempt) -> str:
+    """The verdict on a rung, if it was looked into."""
+    return "set aside" if attempt.is_set_aside else f"{MARK_OF[attempt.verdict.status]} {attempt.verdict.status}"
+
+
 def plain(name: str) -> str:
     """A file's name as text that any program takes: bytes that are no UTF-8, and control characters, become marks."""
     text = name.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
@@ -256,7 +261,7 @@ def _climb(alignment: Alignment) -> str:
     rows = [
         (
             _strong_if(attempt is alignment.best, f"{step}. {attempt.rung}"),
-            f"{MARK_OF[attempt.verdict.status]} {attempt.verdict.status}",
+            outcome(attempt),
             f"{attempt.consensus.count if attempt.consensus else 0:,} of {len(attempt.pairs):,}",
         )
         for step, attempt in enumerate(alignment.attempts, 1)
