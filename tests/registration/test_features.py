@@ -125,7 +125,8 @@ def test_descriptors_are_whole_numbers_whose_squared_distances_are_exact(detecto
     a = detect(view((351, 207)), options(detector)).descriptors[:300]
     assert a.dtype == np.float32
     assert np.array_equal(a, np.rint(a))
-    lengths = np.sort((a.astype(np.int64) ** 2).sum(1))
+    exact = a.astype(np.int64) @ a.astype(np.int64).T
+    lengths = np.sort(np.diag(exact))
     assert lengths[-1] + lengths[-2] < 2**24  # no partial sum of |a|^2 + |b|^2 - 2 a b, in any order, is larger
     assert np.array_equal(a @ a.T, exact)
     assert np.array_equal(a[:, ::-1] @ a[:, ::-1].T, exact)
