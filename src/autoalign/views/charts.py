@@ -24,6 +24,7 @@ WIDTH, HEIGHT = 360, 150  # units of a chart; at about 1 px each, as on a phone,
 LEFT, RIGHT, TOP, BOTTOM = 44, 342, 12, 128  # of what is plotted in it
 BINS_PER_DECADE = 6
 SHOWN = (1e-4, 1e4)  # values beyond are counted as these
+SAME = 1e-4  # what differs by less over all frames is a constant, and its digits are those of rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +82,8 @@ def over_frames(lines: Mapping[Name, Sequence[float | None]], told: str) -> str:
         return ""
     frames = max(map(len, lines.values()))
     low, high = min(known), max(known)
+    if high - low < SAME:
+        low = high = (low + high) / 2
     room = 0.05 * (high - low) or 0.01 * max(abs(high), 1.0)  # a constant is a line in the middle
     axes = _Axes(x=(1, max(frames, 2)), y=(low - room, high + room))
     decimals = max(0, 1 - math.floor(math.log10(axes.y[1] - axes.y[0])))
