@@ -17,6 +17,8 @@ from autoalign.batch.run import carry_out
 from autoalign.batch.sources import Selection
 from autoalign.cli import watch
 from autoalign.cli.progress import clock, following, tally
+from autoalign.cli.running import in_words
+from autoalign.registration.alignment import AlignOptions
 
 
 @pytest.fixture
@@ -42,17 +44,17 @@ def test_a_folder_onto_a_reference(shots, run):
     assert (shots / "out" / "batch.rrd").read_bytes().startswith(b"RRF")
     second = run(*words, "--exclude", "torn*")
     assert (second.code, second.err.count("\n")) == (0, 1)
-    assert second.out.startswith("1 pairs: 1 aligned, 1 of them done before (0:")
+    assert second.out.startswith("1 pair: 1 aligned, 1 of them done before (0:")
 
 
 def test_a_plan_does_nothing(shots, run):
     planned = run("batch", "in", "--reference", "in/fixed.jpg", "--out-dir", "out", "--plan")
     assert planned.code == 0
     assert "in/moving.jpg -> in/fixed.jpg: out/moving.jpg\n" in planned.out
-    assert planned.out.endswith("2 pairs; 0 were done before, and only those that changed will be done again\n")
+    assert planned.out.endswith("2 pairs; none done before\n")
     assert not (shots / "out").exists()
     chained = run("batch", "in", "--sequence", "--out-dir", "out", "--plan")
-    assert "3 pairs, after 3 links between frames; 0 were" in chained.out
+    assert "3 pairs, after 3 links between frames; none done before" in chained.out
 
 
 def test_a_manifest_from_standard_input(shots, run, monkeypatch):
@@ -143,6 +145,7 @@ def test_watching_until_nothing_comes(shots, run):
     assert (shots / "out" / "moving.jpg").read_bytes() == (shots / "up" / "moving.jpg").read_bytes()
     second = run("watch", "in", *words, "--upload", f"file://{shots}/up")
     assert (second.code, second.out) == (0, "nothing new arrived\n")
+    assert run("watch", "in", *words, "-q").out == ""
     assert run("watch", "nowhere", *words).code == run("watch", "in", *("--reference", "x.png", *words[2:])).code == 3
 
 
@@ -155,7 +158,7 @@ def test_a_watch_that_is_told_to_end_reports_what_it_has_done(shots, run, monkey
 
     monkeypatch.setattr(watch, "carry_out", told_to_end)
     outcome = run("watch", "in", "--reference", "in/fixed.jpg", "--out-dir", "out", "--workers", "1")
-    assert (outcome.code, outcome.out.splitlines()[-1]) == (0, "1 pairs: 1 aligned")
+    assert (outcome.code, outcome.out.splitlines()[-1]) == (0, "1 pair: 1 aligned")
     report = (shots / "out" / "report.html").read_text()
     assert "moving.jpg" in report
     assert "torn.jpg" not in report
@@ -183,5 +186,7 @@ def test_plain_lines_where_there_is_no_terminal(capsys):
 
 
 def test_words():
+    options = in_words(Selection(recursive=True, exclude=("*.txt", "*.md")), AlignOptions(model="rigid"))
+    assert options == {"--recursive": "yes", "--exclude": "*.txt, *.md", "--model": "rigid"}
     assert tally({"rejected": 1200, "aligned": 3, "doubtful": 0}) == "3 aligned, 1,200 rejected"
     assert [clock(seconds) for seconds in (0.4, 61, 3599.7, 3661)] == ["0:00", "1:01", "1:00:00", "1:01:01"]

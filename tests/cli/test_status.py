@@ -16,7 +16,7 @@ from autoalign.files.row import Row
 def out(folder: Path) -> Path:
     """A batch of four, of which one is still to be done."""
     rows = [
-        Row(name="a", fixed="f", moving="a", status="aligned", reason="good", expected_error_px=0.125),
+        Row(name="a", fixed="f", moving="a", status="aligned", reason="good", expected_error_px=0.00125),
         Row(name="b", fixed="f", moving="b", status="rejected", reason="7 of 31 matches agree"),
         Row(name="c", fixed="f", moving="c", status="failed", reason="does not exist: c"),
     ]
@@ -36,7 +36,7 @@ def test_counts_and_the_worst_first(out, run):
         "4 pairs: 1 aligned, 1 rejected, 1 failed, 1 to do",
         "failed c: does not exist: c",
         "rejected b: 7 of 31 matches agree",
-        "aligned a (0.12 px expected): good",
+        "aligned a (0.00125 px expected): good",
     ]
     assert len(run("status", out, "--worst", "1").out.splitlines()) == 2
 

@@ -100,7 +100,7 @@ def test_a_row_is_all_there(tmp_path: Path) -> None:
     ):
         assert row[name] == getattr(shifted, name)
     assert row["shift_px"] == pytest.approx(5.0)
-    assert row["motion"] == "turned by 0.0°, 1 times as large"
+    assert row["motion"] == "turned by 0.0°, of the same size"
     assert row["links"] == {"output": "./a.jpg", "sidecar": "./a.jpg.autoalign.json"}
     assert isinstance(row["thumbnails"], list)
     assert [found.picture(number) for number in row["thumbnails"]] == [pictures.fixed, pictures.before, pictures.after]

@@ -10,7 +10,8 @@ from recordings import Case
 
 import autoalign as aa
 from autoalign.registration.verdict import VerdictOptions
-from autoalign.views.words import checks, literal, number, plain, power, report
+from autoalign.views.motion import Motion
+from autoalign.views.words import checks, counted, literal, moved, number, plain, power, report
 
 
 def test_the_verdict_comes_first_in_words(aligned: Case, doubtful: Case, rejected: Case) -> None:
@@ -64,6 +65,15 @@ def test_typed_points_are_asked_nothing() -> None:
     text = report(alignment)
     assert "1.1 times as large" in text
     assert "evidence" not in text
+
+
+def test_what_is_hardly_turned_is_not_turned_back() -> None:
+    still = Motion(shift_px=(3.0, 4.0), turn_rad=-1e-9, scale=1.0, mirrored=True)
+    assert moved(still) == "mirrored, turned by 0.0°, of the same size"
+
+
+def test_one_is_no_plural() -> None:
+    assert [counted(count, "pair") for count in (0, 1, 2000)] == ["0 pairs", "1 pair", "2,000 pairs"]
 
 
 def test_every_rung_is_told(doubtful: Case, aligned: Case) -> None:

@@ -30,6 +30,7 @@ from autoalign.files.row import Row
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
 from autoalign.registration.sequence import links
+from autoalign.views.words import counted
 
 STDIN = Path("-")
 MAX_MANIFEST_BYTES = 1 << 28
@@ -170,7 +171,8 @@ def _tell_plan(jobs: Sequence[Job], reference: int | None, out_dir: Path) -> Exi
         print(f"{shown(job.moving)} -> {shown(job.fixed)}: {job.output}{before}")
     again = sum(job.name in known for job in jobs)
     chained = f", after {len(links(len(jobs), reference)):,} links between frames" if reference is not None else ""
-    tell(f"{len(jobs):,} pairs{chained}; {again:,} were done before, and only those that changed will be done again")
+    before = f"{again:,} done before, of which only those that changed are done again" if again else "none done before"
+    tell(f"{counted(len(jobs), 'pair')}{chained}; {before}")
     return Exit.DONE
 
 
@@ -193,7 +195,7 @@ def _tell_end(rows: Sequence[Row], total: int, plan_done: int, seconds: float, c
     counts = Counter(row.status for row in rows)
     left = f", {total - len(rows):,} not done" if total > len(rows) else ""
     before = f", {plan_done:,} of them done before" if plan_done else ""
-    tell(f"{total:,} pairs: {tally(counts)}{left}{before} ({clock(seconds)})")
+    tell(f"{counted(total, 'pair')}: {tally(counts)}{left}{before} ({clock(seconds)})")
     wrong = [row for row in rows if row.status != "aligned"]
     for row in wrong[:TOLD]:
         tell(f"{row.status} {row.name}: {row.reason}", style=STYLE_OF[row.status], to_stderr=True)

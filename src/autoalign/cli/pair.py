@@ -30,6 +30,7 @@ from autoalign.registration.drawing import Drawing
 from autoalign.registration.refine import RefineOptions
 from autoalign.registration.typed import align_points
 from autoalign.registration.verdict import VerdictOptions
+from autoalign.views.words import number
 
 # One flag per field of every stage, under the field's own name and a heading of the stage's.
 for stage, heading in ((RansacOptions, "Consensus"), (RefineOptions, "Refinement"), (VerdictOptions, "Verdict")):
@@ -158,7 +159,7 @@ def verdict_line(alignment: Alignment, seconds: float) -> str:
     found = f"{alignment.inliers:,} of {alignment.matches:,} matches agree"
     numbers = [found if alignment.best.consensus else f"{alignment.matches} typed points"]
     if alignment.expected_error_px is not None:
-        numbers.append(f"expected error {alignment.expected_error_px:.2f} px")
+        numbers.append(f"expected error {number(alignment.expected_error_px)} px")
     if alignment.best.evidence:
         numbers.append(f"overlap {alignment.overlap:.0%}")
     numbers.append(f"{seconds:.1f} s")

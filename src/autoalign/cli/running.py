@@ -83,5 +83,11 @@ def in_words(*options: Any) -> dict[str, str]:
             if is_dataclass(value):
                 told |= in_words(value)
             elif value != field.default:
-                told[f"--{field.name.replace('_', '-')}"] = ", ".join(value) if isinstance(value, tuple) else str(value)
+                told[f"--{field.name.replace('_', '-')}"] = _in_words(value)
     return told
+
+
+def _in_words(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(value) if isinstance(value, tuple) else str(value)

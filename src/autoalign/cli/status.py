@@ -16,6 +16,7 @@ from autoalign.cli.progress import clock, tally
 from autoalign.cli.terminal import FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
 from autoalign.files.row import Row
 from autoalign.files.write import write_bytes_atomically
+from autoalign.views.words import counted, number
 
 STDOUT = Path("-")
 RECENT_S = 60.0  # over which the rate of a batch that runs is taken
@@ -78,7 +79,10 @@ def _tell_state(ledger: LedgerReader, worst: int) -> None:
     counts = ledger.counts()
     pending = counts["pending"]
     done = sum(counts.values()) - pending
-    tell(f"{done + pending:,} pairs: {tally(counts) or 'nothing done'}" + (f", {pending:,} to do" if pending else ""))
+    tell(
+        f"{counted(done + pending, 'pair')}: {tally(counts) or 'nothing done'}"
+        + (f", {pending:,} to do" if pending else "")
+    )
     runs = ledger.runs()
     if runs and runs[-1].ended is None and pending:
         span = min(RECENT_S, max(time.time() - runs[-1].started, 1.0))
@@ -86,5 +90,5 @@ def _tell_state(ledger: LedgerReader, worst: int) -> None:
         left = f", {clock(pending * span / recent)} left" if recent else ""
         tell(f"{recent} in the last {span:.0f} s{left}; if it does not run, the same command goes on with it")
     for row in ledger.worst(worst):
-        error = "" if row.expected_error_px is None else f" ({row.expected_error_px:.2f} px expected)"
+        error = "" if row.expected_error_px is None else f" ({number(row.expected_error_px)} px expected)"
         tell(f"{row.status} {row.name}{error}: {row.reason}", style=STYLE_OF[row.status])

@@ -29,6 +29,7 @@ from autoalign.files.read import ReadOptions, read_picture
 from autoalign.files.remote import check_upload
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
+from autoalign.views.words import counted
 
 UNSETTLED_S = 0.5  # between looks while a file is still being written
 
@@ -90,7 +91,8 @@ def watch(
                 telling.keep_up()
         reports = telling.finish()
     upload_reports(reports, running)
-    tell(f"{counts.total():,} pairs: {tally(counts)}" if counts else "nothing new arrived")
+    if not common.quiet:
+        tell(f"{counted(counts.total(), 'pair')}: {tally(counts)}" if counts else "nothing new arrived")
     return Exit.DONE if set(counts) <= {"aligned"} else Exit.NOT_ALIGNED
 
 

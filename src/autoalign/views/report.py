@@ -25,7 +25,7 @@ from autoalign.files.write import writing_atomically
 from autoalign.views.charts import log_histogram, over_frames, shares
 from autoalign.views.motion import Motion, motion
 from autoalign.views.tally import Tally
-from autoalign.views.words import MARK_OF, moved, number, plain
+from autoalign.views.words import MARK_OF, counted, moved, number, plain
 
 _ROWS = "<!-- rows -->"  # where they stand in the template
 _FOUND = ("matches", "inliers", "overlap")  # fields of a row, of which a failed pair knows none
@@ -129,7 +129,7 @@ def _summary(tally: Tally, about: Mapping[str, str], drift: list[Motion | None] 
     total = tally.total
     cards = [_errors_card(tally), _about_card(about), "" if drift is None else _drift_card(drift)]
     return {
-        "subtitle": f"{total:,} {'pair' if total == 1 else 'pairs'} · autoalign {__version__}",
+        "subtitle": f"{counted(total, 'pair')} · autoalign {__version__}",
         "bar": shares(counts),
         "filters": "\n".join(
             [

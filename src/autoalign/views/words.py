@@ -187,10 +187,17 @@ def number(value: float) -> str:
     return "∞" if math.isinf(value) else f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
+def counted(count: int, thing: str) -> str:
+    """So many things, of which one is no plural: "1 pair", "2,000 pairs"."""
+    return f"{count:,} {thing}{'' if count == 1 else 's'}"
+
+
 def moved(by: Motion) -> str:
     """What a transform does, but for the shift."""
     mirrored = "mirrored, " if by.mirrored else ""
-    return f"{mirrored}turned by {math.degrees(by.turn_rad):.1f}°, {number(by.scale)} times as large"
+    scale = number(by.scale)
+    size = "of the same size" if scale == "1" else f"{scale} times as large"
+    return f"{mirrored}turned by {math.degrees(by.turn_rad):z.1f}°, {size}"
 
 
 def power(log10: float) -> str:
