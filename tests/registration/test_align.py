@@ -349,7 +349,22 @@ def test_wrong_calls_are_value_errors(name):
         align(**pictures, **{f"{name}_valid": np.ones((3, 3), bool)})
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [{"model": "afine"}, {"detector": "surf"}, {"effort": "some"}, {"time_limit": -1.0}, {"time_limit": np.nan}],
+)
+def test_options_that_there_are_not_are_value_errors(wrong):
+    with pytest.raises(ValueError, match=f"^{next(iter(wrong))} "):
+        AlignOptions(**wrong)
+
+
 # The record
+
+
+def test_what_people_see_of_it_is_a_line():
+    alignment = align(*unrelated())
+    assert repr(alignment) == f"<Alignment rejected: {alignment.reason}>"
+    assert repr(alignment.best) == f"<Attempt {alignment.best.rung}, rejected: {alignment.reason}>"
 
 
 def loaded(image: np.ndarray, name: str) -> LoadedPicture:

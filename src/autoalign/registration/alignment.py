@@ -6,7 +6,7 @@ The viewer, the report, the sidecar and the command line all read this one recor
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from autoalign.errors import AlignmentError
 from autoalign.geometry.family import ModelName
@@ -44,6 +44,13 @@ class AlignOptions:
     refine: RefineOptions = field(default_factory=RefineOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
 
+    def __post_init__(self) -> None:
+        for name, choices in (("model", ModelChoice), ("detector", DetectorChoice), ("effort", Effort)):
+            if getattr(self, name) not in get_args(choices):
+                raise ValueError(f"{name} is one of {', '.join(get_args(choices))}, not {getattr(self, name)}")
+        if self.time_limit is not None and not self.time_limit >= 0:
+            raise ValueError(f"time_limit must be 0 or more, not {self.time_limit}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
@@ -62,6 +69,9 @@ class Attempt:
     fixed_from_moving: Array | None = None  # (3, 3) of unit norm: the refinement's, in its simplest model
     evidence: Evidence | None = None
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
+
+    def __repr__(self) -> str:
+        return f"<Attempt {self.rung}, {self.verdict.status}: {self.verdict.reason}>"
 
     @property
     def log10_false_alarms(self) -> float:
@@ -83,6 +93,9 @@ class Alignment:
     options: AlignOptions
     attempts: tuple[Attempt, ...]  # in the order they were made
     best: Attempt  # the one that the verdict is about
+
+    def __repr__(self) -> str:  # with all evidence it would be pages of numbers
+        return f"<Alignment {self.status}: {self.reason}>"
 
     @property
     def verdict(self) -> Verdict:
