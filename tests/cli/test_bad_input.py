@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -108,6 +110,21 @@ def test_no_place_to_write(bad, run):
 )
 def test_wrong_usage(pictures, run, words):
     assert_refused(run, pictures, 2, *words)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("batch - --out-dir out <&-", 3, "autoalign: is no manifest (has no rows): stdin\n"),
+        ("--version >&-", 0, ""),
+        ("--version >/dev/full", 3, "autoalign: cannot be used (No space left on device): stdout\n"),
+    ],
+)
+def test_streams_that_are_closed_or_full(folder, words, code, said):
+    shell = subprocess.run(
+        f'"{sys.executable}" -m autoalign.cli.main {words}', shell=True, stderr=subprocess.PIPE, text=True, timeout=60
+    )
+    assert (shell.returncode, shell.stderr) == (code, said)
 
 
 def test_bad_points(pictures, run):

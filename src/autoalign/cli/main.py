@@ -5,6 +5,7 @@ Commands are imported when they are called, so that `autoalign --help` waits for
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -125,6 +126,7 @@ EXIT_OF: dict[type[BaseException], Exit] = {
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run one command line, by default this process's, and return its exit code."""
     tokens = sys.argv[1:] if tokens is None else tokens
+    _open_closed_streams()
     try:
         done: Exit | None = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
@@ -138,9 +140,18 @@ def main(tokens: Sequence[str] | None = None) -> int:
         return code
 
 
+def _open_closed_streams() -> None:
+    """Streams that whoever called has closed lead nowhere: else the next file opened would take their place."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - for the life of the process
+
+
 def _reason(error: BaseException, code: Exit) -> str:
     if code == Exit.INTERRUPTED:
         return "interrupted"
+    if isinstance(error, OSError) and error.strerror:
+        return f"cannot be used ({error.strerror}): {error.filename or 'stdout'}"
     reason = str(error) or type(error).__name__
     return reason if code != Exit.BUG else f"this is a bug ({type(error).__name__}: {reason}); -v shows where"
 
