@@ -17,6 +17,7 @@ import numpy as np
 from autoalign.geometry.family import Model
 from autoalign.geometry.homography import Array, invert, normalisation, project, project_and_slope, unit
 
+_SAMPLED = 200  # pairs that are enough to see how far supports overlap
 TUKEY = 4.685  # 95 % efficiency at a normal distribution
 _CONVERGED = 1e-7  # step, in coordinates where the points are about 1 from their mean: 1e-4 px of any picture
 
@@ -29,6 +30,9 @@ class Correspondences:
     dst: Array  # (n, 2)
     src_sigma: Array  # (n,) expected error of a point, px of its picture
     dst_sigma: Array  # (n,)
+    support_px: float = (
+        0.0  # side of the square of dst that each was measured on: where these overlap, so does the noise
+    )
 
     def __len__(self) -> int:
         return len(self.src)
@@ -41,11 +45,19 @@ class Correspondences:
             dst=self.dst[chosen],
             src_sigma=self.src_sigma[chosen],
             dst_sigma=self.dst_sigma[chosen],
+            support_px=self.support_px,
         )
 
-    def swapped(self) -> Correspondences:
-        """The same pairs with src for dst."""
-        return Correspondences(src=self.dst, dst=self.src, src_sigma=self.dst_sigma, dst_sigma=self.src_sigma)
+    def times_seen(self) -> float:
+        """How many times the same noise is counted among the pairs, in the mean: 1 where no supports overlap.
+
+        The design effect (Kish 1965): the mean of n such errors has the variance of n / times_seen independent ones.
+        """
+        if not self.support_px or not len(self):
+            return 1.0
+        some = self.dst[:: max(1, len(self) // _SAMPLED)]
+        apart = np.abs(some[:, None] - self.dst) / self.support_px
+        return float(np.maximum(1.0 - apart, 0.0).prod(2).sum(1).mean())
 
 
 def correspondences(src: Array, dst: Array, src_sigma: float = 1.0, dst_sigma: float = 1.0) -> Correspondences:
@@ -61,6 +73,7 @@ def joined_pairs(parts: Sequence[Correspondences]) -> Correspondences:
         dst=np.concatenate([part.dst for part in parts]),
         src_sigma=np.concatenate([part.src_sigma for part in parts]),
         dst_sigma=np.concatenate([part.dst_sigma for part in parts]),
+        support_px=max(part.support_px for part in parts),
     )
 
 

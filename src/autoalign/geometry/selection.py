@@ -20,27 +20,27 @@ def simplest_model(general: ModelName, dst_from_src: Array, pairs: Correspondenc
 
     `dst_from_src` is the fitted transform of the general model.
     """
-    sigma = robust_scale(_errors(dst_from_src, pairs), 0.01)
+    sigma, times_seen = robust_scale(_errors(dst_from_src, pairs), 0.01), pairs.times_seen()
     there, _ = project(dst_from_src, pairs.src)  # where no wrong pair leads the start astray
-    hopeless = 0.5 * _CLIP_SIGMAS**2 * len(pairs)  # half of the pairs denied, where no more than a few may be
-    best, chosen = _criterion(MODELS[general], dst_from_src, pairs, sigma), (general, dst_from_src)
+
+    def criterion(model: Model, transform: Array) -> float:
+        misfit = np.minimum(_errors(transform, pairs) / sigma**2, _CLIP_SIGMAS**2).sum() / times_seen
+        return float(misfit + model.degrees_of_freedom * np.log(2 * len(pairs) / times_seen))
+
+    hopeless = 0.5 * _CLIP_SIGMAS**2 * len(pairs) / times_seen  # half of the pairs denied, where only a few may be
+    best, chosen = criterion(MODELS[general], dst_from_src), (general, dst_from_src)
     for model in MODELS.values():
         if model.name == general:
             break
         transform = fit(model.name, pairs.src, there)
-        if _criterion(model, transform, pairs, sigma) > hopeless:
+        if criterion(model, transform) > hopeless:
             continue
         transform = polish(model, transform, pairs, sigma_floor=sigma)
-        criterion = _criterion(model, transform, pairs, sigma)
-        if criterion < best:
-            best, chosen = criterion, (model.name, transform)
+        value = criterion(model, transform)
+        if value < best:
+            best, chosen = value, (model.name, transform)
     return chosen
 
 
 def _errors(transform: Array, pairs: Correspondences) -> Array:
     return symmetric_transfer_error_squared(transform, pairs.src, pairs.dst, pairs.src_sigma, pairs.dst_sigma)
-
-
-def _criterion(model: Model, transform: Array, pairs: Correspondences, sigma: float) -> float:
-    misfit = np.minimum(_errors(transform, pairs) / sigma**2, _CLIP_SIGMAS**2).sum()
-    return float(misfit + model.degrees_of_freedom * np.log(2 * len(pairs)))

@@ -47,17 +47,29 @@ def uncertainty(model: Model, dst_from_src: Array, pairs: Correspondences) -> Un
     normal = np.einsum("nig,nih->gh", slope * weights[:, None, None], slope)
     freedom = max(2.0 * weights.sum() - model.degrees_of_freedom, 1.0)
     variance = float((weights * squared).sum() / freedom) / _VARIANCE_LEFT
+    counted = weights > 0  # weights that fall with the residual would hide the pattern itself
+    times_seen = pairs[counted].times_seen()
+    pattern = _pattern(pairs.src[counted], residuals[counted], times_seen)
+    # What neighbours share moves the fit as a few errors would, not as many.
+    spread = times_seen * _COVARIANCE_LEFT * variance + pattern.sharing * 0.5 * pattern.px**2
     return Uncertainty(
-        covariance=_COVARIANCE_LEFT * variance * np.linalg.pinv(normal, hermitian=True),
+        covariance=spread * np.linalg.pinv(normal, hermitian=True),
         norm=norm,
         residual_px=float(np.sqrt(variance)),
-        # Weights that fall with the residual would hide the pattern itself.
-        model_px=_systematic(pairs.src[weights > 0], residuals[weights > 0]),
+        model_px=pattern.px,
     )
 
 
-def _systematic(points: Array, residuals: Array) -> float:
-    """Root-mean-square of the part of the residuals that neighbours share, beyond what noise alone would give.
+@dataclass(frozen=True, kw_only=True)
+class _Pattern:
+    """The part of the residuals that neighbours share."""
+
+    px: float  # root-mean-square of it
+    sharing: float  # neighbours that share it
+
+
+def _pattern(points: Array, residuals: Array, times_seen: float) -> _Pattern:
+    """What neighbours share of the residuals beyond what noise alone, seen so many times, would give.
 
     The mean residual of a cell of a grid has the variance of the noise over its count, if there is only noise.
     """
@@ -69,11 +81,12 @@ def _systematic(points: Array, residuals: Array) -> float:
     mean = np.stack([np.bincount(index, r, cells) for r in residuals.T], 1) / np.maximum(count, 1)[:, None]
     full = count >= 3
     if full.sum() < 3:
-        return 0.0
+        return _Pattern(px=0.0, sharing=0.0)
     within = ((residuals - mean[index]) ** 2).sum(1)
     noise = within[full[index]].sum() / (count[full].sum() - full.sum())
-    excess = (mean[full] ** 2).sum(1) - noise / count[full]
-    return float(np.sqrt(max(float(np.average(excess, weights=count[full])), 0.0)))
+    excess = (mean[full] ** 2).sum(1) - times_seen * noise / count[full]
+    squared = float(np.average(excess, weights=count[full]))
+    return _Pattern(px=float(np.sqrt(max(squared, 0.0))), sharing=float(np.average(count[full], weights=count[full])))
 
 
 def point_errors(model: Model, dst_from_src: Array, known: Uncertainty, points: Array) -> Array:

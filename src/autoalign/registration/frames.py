@@ -26,6 +26,7 @@ def in_pixels_of(attempt: Attempt, fixed_from_own: Array, moving_from_own: Array
             dst=apply(fixed_from_own, of.dst),
             src_sigma=of.src_sigma * moving_px,
             dst_sigma=of.dst_sigma * fixed_px,
+            support_px=of.support_px * fixed_px,
         )
 
     def transform(of: Array) -> Array:

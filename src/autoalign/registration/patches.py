@@ -14,7 +14,7 @@ Sources: Gruen 1985 (least-squares matching); Lucas and Kanade 1981; Benhimane a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -69,21 +69,22 @@ def compare_both_ways(
     back = compare(moving, fixed, moving_from_fixed, apply(moving_from_fixed, places), radius, cubic=True)
     inside = there.inside & back.inside
     return Comparison(
-        pairs=_mean(there.pairs, back.pairs.swapped()),
+        pairs=_mean(there.pairs, back.pairs),
         shift=np.maximum(np.abs(there.shift), np.abs(back.shift)),
         correlation=np.where(inside, (there.correlation + back.correlation) / 2, -1.0),
         inside=inside,
     )
 
 
-def _mean(a: Correspondences, b: Correspondences) -> Correspondences:
-    """Two sets of the same pairs as one. They lie within a pixel of each other, where a transform is as good as affine:
-    the residual of a mean is the mean of the residuals. Both see the same noise, so that it is no smaller."""
-    return Correspondences(
-        src=(a.src + b.src) / 2,
-        dst=(a.dst + b.dst) / 2,
-        src_sigma=(a.src_sigma + b.src_sigma) / 2,
-        dst_sigma=(a.dst_sigma + b.dst_sigma) / 2,
+def _mean(there: Correspondences, back: Correspondences) -> Correspondences:
+    """The same pairs, measured both ways, as one. Both lie within a pixel, where a transform is as good as affine: the
+    residual of their mean is the mean of their residuals. Both see the same noise, so that it is no smaller."""
+    return replace(
+        there,
+        src=(there.src + back.dst) / 2,
+        dst=(there.dst + back.src) / 2,
+        src_sigma=(there.src_sigma + back.dst_sigma) / 2,
+        dst_sigma=(there.dst_sigma + back.src_sigma) / 2,
     )
 
 
@@ -132,6 +133,7 @@ def compare(
             dst=apply(fixed.full_from_small, centres),
             src_sigma=sigma * moving.full_from_small[0, 0],
             dst_sigma=sigma * fixed.full_from_small[0, 0],
+            support_px=float((2 * radius + 1) * fixed.full_from_small[0, 0]),
         ),
         shift=shift,
         correlation=correlation,
