@@ -32,7 +32,9 @@ def strips(pixels):
 def test_what_is_written_is_read_back(tmp_path, channels, dtype):
     pixels = picture(channels, dtype)
     write_in_strips(tmp_path / "a.tif", strips(pixels), pixels)
-    assert np.array_equal(read_picture(tmp_path / "a.tif").pixels, pixels)
+    loaded = read_picture(tmp_path / "a.tif")
+    assert np.array_equal(loaded.pixels, pixels)
+    assert loaded.remark is None  # the overviews are no pages that were left out
 
 
 def test_overviews_are_means_of_two_by_two(tmp_path):

@@ -171,7 +171,9 @@ def test_pages_of_a_tiff(tmp_path: Path, make_picture: Any) -> None:
             writer.write(page, photometric="rgb" if page.ndim == 3 else "minisblack")
     np.testing.assert_array_equal(read_picture(tmp_path / "a.tif").pixels, pages[0])
     np.testing.assert_array_equal(read_picture(tmp_path / "a.tif", page=1).pixels, pages[1])
-    assert "no page 2" in refusal(tmp_path / "a.tif", page=2)
+    assert "several pages" in str(read_picture(tmp_path / "a.tif").remark)
+    assert read_picture(tmp_path / "a.tif", page=1).remark is None  # who asks for a page knows
+    assert "has no page 2; its last is 1, counted from 0" in refusal(tmp_path / "a.tif", page=2)
     assert "no page 1" in refusal(saved(tmp_path / "a.png", Image.fromarray(pages[0])), page=1)
 
 

@@ -177,6 +177,14 @@ def test_an_overview_spares_the_full_picture(tmp_path, sub):
         assert np.array_equal(whole.pixels, ramp[..., 0])
 
 
+def test_pages_that_are_left_out_are_told(tmp_path):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.stack([picture()] * 2), tile=(64, 64), photometric="rgb")
+    for number, told in ((0, "has several pages, of which the first was taken"), (1, None)):
+        with opened_large(path, above_pixels=1, max_pixels=1e6, number=number) as large:
+            assert large.remark == told
+
+
 def test_a_page_that_shows_something_else_is_no_overview(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         file.write(picture(), tile=(64, 64), photometric="rgb")

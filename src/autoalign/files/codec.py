@@ -24,6 +24,7 @@ class Header:
     size: tuple[int, int]  # (w, h) as stored, before the orientation is applied
     orientation: int  # 1 to 8, as EXIF counts them
     metadata: Metadata
+    remark: str | None = None  # what of the file is not taken, a sentence
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,7 +32,7 @@ class LoadedPicture:
     sha256: str  # of the file's bytes, 64 hexadecimal digits
     format: str  # "JPEG", "PNG", ...: what the bytes are, whatever the extension says
     path: Path
-    remark: str | None = None  # what had to be overlooked to read it, a sentence
+    remark: str | None = None  # what of the file was overlooked, a sentence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,8 @@ def _decoded(
     max_pixels = options.max_pixels or MAX_PIXELS
     try:
         try:
-            return *_decoded_by(decoder_for(format, page), data, max_pixels), None
+            header, pixels = _decoded_by(decoder_for(format, page), data, max_pixels)
+            return header, pixels, header.remark
         except Refused:
             raise
         except Exception as error:  # decoders raise what they like on damaged bytes: struct, zlib, memory, their own

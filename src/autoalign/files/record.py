@@ -84,7 +84,7 @@ def versions() -> dict[str, str]:
 
 
 def _remarks(fixed: AnyPicture, moving: AnyPicture) -> dict[str, Any]:
-    """What had to be overlooked to read the files; nothing where nothing had."""
+    """What of the files was overlooked; nothing where nothing was."""
     said = {name: loaded.remark for name, loaded in (("fixed", fixed), ("moving", moving)) if loaded.remark}
     return {"reading": said} if said else {}
 

@@ -10,6 +10,7 @@ import logging
 import struct
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,7 +70,19 @@ def _read_header(data: bytes, number: int) -> Header:
             size=(page.imagewidth, page.imagelength),
             orientation=orientation if orientation in range(1, 9) else 1,
             metadata=read_metadata(data, page, number),
+            remark=left_out(page, number),
         )
+
+
+def left_out(page: Any, number: int) -> str | None:
+    """What is said of a file whose first page was taken although it has others, which are more than smaller copies."""
+    if number != 0:
+        return None
+    try:
+        others = any(not (other.is_reduced or other.is_mask) for other in islice(page.parent.pages, 1, None))
+    except Exception:  # a page that is not wanted may be as damaged as it likes
+        return None
+    return "has several pages, of which the first was taken" if others else None
 
 
 def _decode_leniently(data: bytes, number: int) -> Picture:
@@ -154,7 +167,7 @@ def _page(data: bytes, number: int) -> Iterator[Any]:
         except IndexError:
             if number == 0:
                 raise ValueError("the first page is missing") from None
-            raise Refused(f"has no page {number} (pages count from 0)") from None
+            raise Refused(f"has no page {number}; its last is {len(file.pages) - 1}, counted from 0") from None
         yield page
 
 

@@ -51,7 +51,7 @@ class LargePicture:
     sha256: str  # of the file's bytes, 64 hexadecimal digits
     format: str
     path: Path
-    remark: str | None = None  # nothing is overlooked
+    remark: str | None = None  # what of the file is not taken, a sentence
 
     def working_copy(self, max_pixels: float) -> Shrunken:
         """The picture made smaller to at most `max_pixels`, from the smallest overview that has more, if there is one.
@@ -190,6 +190,7 @@ def opened_large(
             sha256=hashlib.file_digest(file, "sha256").hexdigest(),
             format=TIFF.name,
             path=path,
+            remark=tiff.left_out(page, number),
         )
 
 
