@@ -40,6 +40,7 @@ EVIDENCE = Evidence(
     anisotropy=1.1,
     halves_px=0.02,
     fit_px=0.01,
+    residual_px=0.05,
     model_px=0.01,
 )
 
@@ -129,9 +130,9 @@ def test_the_error_allowed_grows_with_the_picture():
 
 
 def test_the_expected_error_grows_with_each_of_its_parts():
-    least = expected_error(replace(EVIDENCE, fit_px=0.0, halves_px=0.0, model_px=0.0))
+    least = expected_error(replace(EVIDENCE, fit_px=0.0, halves_px=0.0, model_px=0.0, residual_px=0.0))
     assert 0 < least < 0.02  # a floor: nobody knows a transform exactly
-    for part in ("fit_px", "halves_px", "model_px"):
+    for part in ("fit_px", "halves_px", "model_px", "residual_px"):
         small, large = (expected_error(replace(EVIDENCE, **{part: px})) for px in (1.0, 2.0))
         assert expected_error(EVIDENCE) < small < large
     assert np.isfinite(expected_error(replace(EVIDENCE, halves_px=float("inf"))))  # too few to halve: the fit says it

@@ -79,6 +79,7 @@ class Evidence(Chance):
     anisotropy: float  # greatest ratio of the two scales at one point; inf if the overlay folds or mirrors
     halves_px: float  # mean distance over the overlap of the transforms of two disjoint halves of the evidence
     fit_px: float  # what the covariance of the fit leaves, mean over the overlap
+    residual_px: float  # standard deviation of one coordinate of what is left of the pairs that were fitted
     model_px: float  # what the residuals show that the model cannot follow
 
 
@@ -135,6 +136,7 @@ def weigh(
         anisotropy=anisotropy,
         halves_px=_halves(MODELS[model], transform, fitted, overlap),
         fit_px=_root_mean_square(point_errors(MODELS[model], transform, spread, overlap)),
+        residual_px=spread.residual_px,
         model_px=spread.model_px,
     )
 
@@ -186,14 +188,16 @@ def _halves(model: Model, transform: Array, fitted: Correspondences, points: Arr
 
 
 def expected_error(evidence: Evidence) -> float:
-    """Mean error over the overlap in fixed px: the fit's, what the model cannot follow, and a floor.
+    """Mean error over the overlap in fixed px: the fit's, what the model cannot follow, a bias, and a floor.
 
     Two independent halves of the evidence differ by twice the error of the whole, which is the fit's error measured
     without any assumption; the larger of the two counts. What the model cannot follow is seen only where the evidence
-    is, and robust fitting leaves out the worst of it: it counts several times.
+    is, and robust fitting leaves out the worst of it: it counts several times. What moves all pairs the same way, as
+    light of another gradation moves the middle of every edge, is seen in none of these, but makes pairs scatter.
     """
     fit = max(evidence.fit_px, 0.5 * evidence.halves_px if np.isfinite(evidence.halves_px) else 0.0)
-    return float(np.sqrt(fit**2 + (_MODEL_FACTOR * evidence.model_px) ** 2 + _FLOOR_PX**2))
+    model, bias = _MODEL_FACTOR * evidence.model_px, _BIAS * evidence.residual_px
+    return float(np.sqrt(fit**2 + model**2 + bias**2 + _FLOOR_PX**2))
 
 
 def hints(log10_false_alarms: float) -> bool:
@@ -207,6 +211,7 @@ def hints(log10_false_alarms: float) -> bool:
 
 _FLOOR_PX = 0.002
 _MODEL_FACTOR = 2.0  # true over seen error of scenes that are no plane (scripts/calibrate.py)
+_BIAS = 0.15  # share of the scatter that no number of pairs averages out, on views with other gradation, blur and noise
 _HINT = -1.0  # true pairs that a harder attempt saved had -3.4 and less
 _ALL_THERE_IS = -150.0  # and those had -86 and more
 
