@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
@@ -82,14 +83,14 @@ def test_a_black_or_tiny_picture_is_a_rejected_pair(folder, run, shape):
 
 def test_a_doubtful_pair_leaves_its_record_and_the_overlay_to_look_at(pictures, run):
     outcome = run("pair", "fixed.jpg", "moving.jpg", "--max-expected-error-px", "1e-9", "--max-expected-error-share",
-                  "1e-12", "--overlay", "overlay.png", "-o", "out.png")  # fmt: skip
+                  "1e-12", "--overlay", "overlay.png", "-o", "it is.png")  # fmt: skip
     assert outcome.code == 1
     assert outcome.out.startswith("doubtful: ")
     assert "overlap" in outcome.out
-    assert names(pictures) == {"fixed.jpg", "moving.jpg", "overlay.png", "out.autoalign.json"}
-    applied = run("apply", "out.autoalign.json", "moving.jpg", "-o", "out.png")
-    assert applied.code == 0
-    assert (pictures / "out.png").exists()
+    assert names(pictures) == {"fixed.jpg", "moving.jpg", "overlay.png", "it is.autoalign.json"}
+    (command,) = re.findall("this makes the picture: autoalign (.*)", outcome.err)
+    assert run(*shlex.split(command)).code == 0
+    assert (pictures / "it is.png").exists()
 
 
 def test_json_on_stdout_leaves_the_words_to_stderr(pictures, run):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -143,6 +144,8 @@ def pair(
             tell(line, style=STYLE_OF[alignment.status], to_stderr=sidecar is None)
         if alignment.verdict.advice:
             note(f"what may help: {alignment.verdict.advice}", common)
+        if alignment.status == "doubtful" and sidecar is not None:
+            note(f"once you have looked, this makes the picture: {_making(sidecar, moving, output, files)}", common)
         if output not in written and output.exists():
             note(f"left as it was, from an earlier run: {output}", common)
         if written:
@@ -165,6 +168,12 @@ def verdict_line(alignment: Alignment, seconds: float) -> str:
     numbers.append(f"{seconds:.1f} s")
     why = f": {alignment.reason}" if alignment.status == "doubtful" else ""
     return f"{alignment.status}: {', '.join(numbers)}{why}"
+
+
+def _making(sidecar: Path, moving: Path, output: Path, files: PairFiles) -> str:
+    """The command that makes the picture of a doubtful pair."""
+    page = ["--page", str(files.moving_page)] if files.moving_page else []
+    return shlex.join(["autoalign", "apply", str(sidecar), str(moving), "-o", str(output), *page])
 
 
 def _default_output(moving: Path, drawn: Picture, large: bool) -> Path:
