@@ -206,5 +206,5 @@ def test_stream_hands_out_what_comes_first() -> None:
 
 
 def test_a_machine_without_workers_is_no_engine() -> None:
-    with pytest.raises(ValueError, match="a worker at least"):
+    with pytest.raises(ValueError, match="at least one worker"):
         LocalEngine(workers=0)

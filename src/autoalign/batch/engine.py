@@ -44,7 +44,7 @@ class LocalEngine:
 
     def __post_init__(self) -> None:
         if self.workers is not None and self.workers < 1:
-            raise ValueError(f"there must be a worker at least, not {self.workers}")
+            raise ValueError(f"there must be at least one worker, not {self.workers}")
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Iterator[Outcome[J, R]]:
         """As `Engine.run`. A worker is started when there is a job for it."""

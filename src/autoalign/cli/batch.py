@@ -22,8 +22,18 @@ from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
 from autoalign.batch.sources import Selection, in_groups, onto_reference, pictures, place_of_reference
 from autoalign.batch.telling import write_reports
 from autoalign.cli.progress import clock, following, tally
-from autoalign.cli.running import RUNNING, Running, engine_of, for_running, in_words, make_folder, upload_reports
+from autoalign.cli.running import (
+    RUNNING,
+    Running,
+    check_reference,
+    engine_of,
+    for_running,
+    in_words,
+    make_folder,
+    upload_reports,
+)
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, note, tell
+from autoalign.errors import ImageReadError
 from autoalign.files.read import ReadOptions, read_text
 from autoalign.files.remote import shown
 from autoalign.files.row import Row
@@ -116,10 +126,12 @@ def _jobs(source: Path, files: BatchFiles, selection: Selection, options: JobOpt
     """What the source holds; for a sequence, which is the frame that the others go onto."""
     if source != STDIN and source.is_dir():
         return _of_folder(source, files, selection, options)
+    if source != STDIN and not source.exists():
+        raise ImageReadError(f"does not exist: {source}")
     wrong = [name for name in ("reference", "sequence", "pattern") if getattr(files, name)]
     wrong += [name for name, value in asdict(selection).items() if value]
     if wrong:
-        raise ValueError(f"--{wrong[0]} is for folders, and this is a manifest: {source}")
+        raise ValueError(f"--{wrong[0]} is for folders, and this is none: {source}")
     if source == STDIN:
         return manifest_jobs(sys.stdin.read(), "stdin", Path.cwd(), files.out_dir, options), None
     text = read_text(source, max_bytes=MAX_MANIFEST_BYTES)
@@ -146,6 +158,7 @@ def _of_folder(
         return frames, reference
     if files.reference is None:
         raise ValueError(f"needs --reference FILE, --sequence or --pattern for a folder: {folder}")
+    check_reference(Path(files.reference), options.reading)
     return onto_reference(folder, names, Path(files.reference), files.out_dir, options), None
 
 

@@ -13,6 +13,8 @@ from autoalign.batch.engine import Engine, LocalEngine
 from autoalign.batch.jobs import Job, rooted
 from autoalign.batch.slot import Limits
 from autoalign.errors import EngineError, ImageWriteError
+from autoalign.files.large import opened_picture
+from autoalign.files.read import ReadOptions
 from autoalign.files.remote import check_upload, upload
 
 RUNNING = Group("Running", sort_key=1.5)
@@ -64,6 +66,12 @@ def upload_reports(reports: Iterable[Path], running: Running) -> None:
     if running.upload:
         for report in reports:
             upload(report, running.upload, report.name)
+
+
+def check_reference(path: Path, reading: ReadOptions) -> None:
+    """Raises ImageReadError for a picture that no pair can be aligned onto: better now than once for each."""
+    with opened_picture(path, reading):
+        pass
 
 
 def make_folder(folder: Path) -> None:

@@ -22,10 +22,19 @@ from autoalign.batch.run import PlanOptions, carry_out, feature_store, planned
 from autoalign.batch.sources import Selection, onto_reference
 from autoalign.batch.telling import Telling, next_turn, write_reports
 from autoalign.cli.progress import tally
-from autoalign.cli.running import RUNNING, Running, engine_of, for_running, in_words, make_folder, upload_reports
+from autoalign.cli.running import (
+    RUNNING,
+    Running,
+    check_reference,
+    engine_of,
+    for_running,
+    in_words,
+    make_folder,
+    upload_reports,
+)
 from autoalign.cli.terminal import ALIGNMENT, FILES, GENERAL, STYLE_OF, Common, Exit, complain, note, tell
 from autoalign.errors import ImageReadError, ImageWriteError
-from autoalign.files.read import ReadOptions, read_picture
+from autoalign.files.read import ReadOptions
 from autoalign.files.remote import check_upload
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.drawing import Drawing
@@ -71,9 +80,9 @@ def watch(
     """
     if not folder.is_dir():
         raise ImageReadError(f"is no folder: {folder}")
-    read_picture(files.reference, reading)  # a reference that is no good should not be found out at night
+    check_reference(files.reference, reading)
     if running.upload:
-        check_upload(running.upload)  # nor should a URL that is none
+        check_upload(running.upload)  # a URL that is none should not be found out at night
     make_folder(files.out_dir)
     wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
     about = {"watched": str(folder)} | in_words(files, selection, drawing, reading, running, options)
