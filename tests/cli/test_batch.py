@@ -57,6 +57,15 @@ def test_a_plan_does_nothing(shots, run):
     assert "3 pairs, after 3 links between frames; none done before" in chained.out
 
 
+def test_what_is_in_no_group_is_told(shots, run):
+    planned = run("batch", "in", "--pattern", "(i)[xn]", "--out-dir", "out", "--plan")
+    assert planned.out.startswith("in/moving.jpg -> in/fixed.jpg: ")
+    assert planned.err == "1 of 3 pictures have no other in their group, as: in/torn.jpg\n"
+    alone = run("batch", "in", "--pattern", "(fix|mov)", "--out-dir", "out", "--plan")
+    assert (alone.code, alone.out) == (2, "")
+    assert "holds no two pictures that go together: in" in alone.err
+
+
 def test_a_manifest_from_standard_input(shots, run, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO("fixed,moving,name\nin/fixed.jpg,in/moving.jpg,here/it.png\n"))
     outcome = run("batch", "-", "--out-dir", "out", "-q")
@@ -94,6 +103,7 @@ def test_a_sequence_goes_onto_one_frame_which_is_among_the_results(folder, run):
         (("nowhere", "--reference", "in/fixed.jpg"), 3, "does not exist: nowhere"),
         (("in", "--reference", "nowhere.jpg"), 3, "does not exist: nowhere.jpg"),
         (("in", "--reference", "in/torn.jpg"), 3, "is damaged"),
+        (("in", "--reference", "in/fixed.jpg", "--include", "fixed*"), 2, "holds no two pictures that go together: in"),
         (("list.csv",), 3, "is no manifest (lacks the column moving): list.csv"),
         (("nowhere.csv",), 3, "does not exist: nowhere.csv"),
         (("in", "--reference", "in/fixed.jpg", "--max-memory", "-1"), 2, "memory limit"),

@@ -97,7 +97,9 @@ def batch(
     """
     started = time.monotonic()
     wanted = JobOptions(align=options, drawing=drawing, reading=reading, recorded=files.save_rrd)
-    jobs, reference = _jobs(source, files, selection, wanted)
+    jobs, reference = _jobs(source, files, selection, wanted, common)
+    if not jobs:
+        raise ValueError(f"holds no two pictures that go together: {source}")
     jobs = for_running(jobs, running)
     if again.plan:
         return _tell_plan(jobs, reference, files.out_dir)
@@ -122,10 +124,12 @@ def batch(
     return _exit(rows, len(jobs))
 
 
-def _jobs(source: Path, files: BatchFiles, selection: Selection, options: JobOptions) -> tuple[list[Job], int | None]:
+def _jobs(
+    source: Path, files: BatchFiles, selection: Selection, options: JobOptions, common: Common
+) -> tuple[list[Job], int | None]:
     """What the source holds; for a sequence, which is the frame that the others go onto."""
     if source != STDIN and source.is_dir():
-        return _of_folder(source, files, selection, options)
+        return _of_folder(source, files, selection, options, common)
     if source != STDIN and not source.exists():
         raise ImageReadError(f"does not exist: {source}")
     wrong = [name for name in ("reference", "sequence", "pattern") if getattr(files, name)]
@@ -139,13 +143,15 @@ def _jobs(source: Path, files: BatchFiles, selection: Selection, options: JobOpt
 
 
 def _of_folder(
-    folder: Path, files: BatchFiles, selection: Selection, options: JobOptions
+    folder: Path, files: BatchFiles, selection: Selection, options: JobOptions, common: Common
 ) -> tuple[list[Job], int | None]:
     names = pictures(folder, selection, without=files.out_dir)
     if files.sequence and files.pattern:
         raise ValueError("--sequence and --pattern exclude each other")
     if files.pattern:
-        return in_groups(folder, names, files.pattern, files.reference or "first", files.out_dir, options), None
+        jobs = in_groups(folder, names, files.pattern, files.reference or "first", files.out_dir, options)
+        _tell_alone(folder, names, jobs, common)
+        return jobs, None
     if files.sequence:
         if files.save_rrd != "none":
             raise ValueError("--save-rrd is for pairs: a frame of a sequence rests on many")
@@ -160,6 +166,14 @@ def _of_folder(
         raise ValueError(f"needs --reference FILE, --sequence or --pattern for a folder: {folder}")
     check_reference(Path(files.reference), options.reading)
     return onto_reference(folder, names, Path(files.reference), files.out_dir, options), None
+
+
+def _tell_alone(folder: Path, names: Sequence[str], jobs: Sequence[Job], common: Common) -> None:
+    """What a pattern leaves without a partner is left out, but not without a word."""
+    paired = {path for job in jobs for path in (job.fixed, job.moving)}
+    alone = [name for name in names if str(folder / name) not in paired]
+    if alone:
+        note(f"{len(alone):,} of {len(names):,} pictures have no other in their group, as: {folder / alone[0]}", common)
 
 
 def _frame(folder: Path, names: Sequence[str], reference: str) -> int:
