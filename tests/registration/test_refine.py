@@ -317,7 +317,7 @@ def test_swapped_roles_give_the_inverse():
     assert mean_error_px(there.fixed_from_moving @ back.fixed_from_moving, round_trip) < 0.01
 
 
-@pytest.mark.parametrize("wrong", [{"patches": -1}, {"radius": 2}, {"rounds": 0}, {"min_correlation": 1.0}])
+@pytest.mark.parametrize("wrong", [{"patches": -1}, {"radius": 2}, {"min_correlation": 1.0}])
 def test_options_out_of_range_are_refused(wrong):
     with pytest.raises(ValueError, match="RefineOptions"):
         RefineOptions(**wrong)

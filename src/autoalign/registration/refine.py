@@ -11,7 +11,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -41,14 +41,11 @@ _CORNER_PIXELS = 1e6  # corners are looked for in a picture that is halved to at
 _LEADING_STEPS = 4  # of the least squares, while a new look corrects them anyway,
 _LAST_STEPS = 30  # and when none will
 _HELD_OUT = 5  # every fifth patch judges
+_LEAST_SIGMAS = 0.02  # of what a patch claims, that residuals may show; under it lies rounding
 
 
 Look = Callable[[Array, NDArray[np.intp], Manner], Comparison]
-"""Patches compared at one resolution: under a transform, those of these numbers, with bilinear or cubic interpolation
-of the moving picture, or with cubic interpolation of each in turn."""
-
-
-_Round = tuple[Look, NDArray[np.intp], Manner]
+"""Patches compared at one resolution: under a transform, those of these numbers, in one of the manners."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,15 +56,13 @@ class RefineOptions:
     """patches compared, at most; 0 leaves the transform of the keypoints as it is"""
     radius: int = 12
     """a patch is 2 x radius + 1 pixels wide"""
-    rounds: int = 1
-    """times that all patches are compared at full size, after a few of them have led the way"""
     min_correlation: float = 0.6
     """normalised correlation above which a patch takes part"""
     max_shift: float = 2.0
     """px; a patch that wants to move further takes no part"""
 
     def __post_init__(self) -> None:
-        if self.patches < 0 or self.radius < 3 or self.rounds < 1 or not 0 < self.min_correlation < 1:
+        if self.patches < 0 or self.radius < 3 or not 0 < self.min_correlation < 1:
             raise ValueError(f"RefineOptions out of range: {self}")
 
 
@@ -122,34 +117,37 @@ def follow(
 
     Returns the consensus unchanged as `refine` does.
     """
-    unchanged = _unchanged(consensus, matched)
-    model = MODELS[consensus.model]
+    unchanged, model = _unchanged(consensus, matched), MODELS[consensus.model]
+    led = _led(looks, count, consensus, options)
+    if led is None:
+        return unchanged
+    finest, everyone = looks[-1], np.arange(count)
+    judges = everyone % _HELD_OUT == 0
+    seen = finest(led, everyone, "both ways")
+    kept = _usable(seen, options)
+    fitted = _fit(model, led, seen, kept & ~judges, _LAST_STEPS)
+    if fitted is None:
+        return unchanged
+    before, after = finest(consensus.dst_from_src, everyone, "fine").correlation, seen.correlation.copy()
+    after[judges] = finest(fitted, everyone[judges], "fine").correlation
+    patches = Patches(pairs=seen.pairs, before=before, after=after, kept=kept)
+    transform = polish(model, fitted, seen.pairs[kept], sigma_floor=_LEAST_SIGMAS)  # the judges know something too
+    if not _helped(before[judges], after[judges]) or _contradicts(model, consensus, transform, matched):
+        return replace(unchanged, patches=patches)
+    return Refinement(fixed_from_moving=transform, pairs=seen.pairs[kept], patches=patches, sharpened=True)
+
+
+def _led(looks: Sequence[Look], count: int, consensus: Consensus, options: RefineOptions) -> Array | None:
+    """Where a few hundred patches lead, so that the others need not go the way; None where they are too few."""
     transform = consensus.dst_from_src
-    finest = looks[-1]
-    everyone = np.arange(count)
-    judges, leaders = everyone[::_HELD_OUT], everyone[everyone % _HELD_OUT != 0]
-    # A few hundred patches lead the way; all of them, and the dearer interpolation, are for the last step.
-    scouts = leaders[:: max(1, count // _SCOUTS)]
-    scouting: list[_Round] = [(look, scouts, "rough") for look in [looks[0], *looks]]
-    everywhere: list[_Round] = [(finest, everyone, "both ways")] * options.rounds
-    for look, chosen, manner in scouting + everywhere:
-        seen = look(transform, chosen, manner)
-        used = _usable(seen, options) & np.isin(chosen, leaders)
-        moved = _fit(model, transform, seen, used, _LEADING_STEPS if manner == "rough" else _LAST_STEPS)
+    scouts = np.flatnonzero(np.arange(count) % _HELD_OUT)[:: max(1, count // _SCOUTS)]
+    for look in [looks[0], *looks]:
+        seen = look(transform, scouts, "rough")
+        moved = _fit(MODELS[consensus.model], transform, seen, _usable(seen, options), _LEADING_STEPS)
         if moved is None:
-            return unchanged
+            return None
         transform = moved
-    before = finest(consensus.dst_from_src, everyone, "fine")
-    judged = finest(transform, judges, "fine")
-    kept, after = _usable(seen, options), seen.correlation.copy()
-    after[judges] = judged.correlation
-    patches = Patches(pairs=seen.pairs, before=before.correlation, after=after, kept=kept)
-    transform = polish(model, transform, seen.pairs[kept], sigma_floor=0.02)  # the judges, too, know something
-    if not _helped(before.correlation[judges], after[judges]) or _contradicts(model, consensus, transform, matched):
-        return Refinement(
-            fixed_from_moving=consensus.dst_from_src, pairs=unchanged.pairs, patches=patches, sharpened=False
-        )
-    return Refinement(fixed_from_moving=transform, pairs=seen.pairs[patches.kept], patches=patches, sharpened=True)
+    return transform
 
 
 def _unchanged(consensus: Consensus, matched: Correspondences) -> Refinement:
@@ -277,7 +275,7 @@ def _fit(model: Model, transform: Array, seen: Comparison, used: Mask, steps: in
     """Robust least squares on some of the patches; None where they are too few to trust."""
     if used.sum() < 3 * model.degrees_of_freedom:
         return None
-    return polish(model, transform, seen.pairs[used], sigma_floor=0.02, max_steps=steps)
+    return polish(model, transform, seen.pairs[used], sigma_floor=_LEAST_SIGMAS, max_steps=steps)
 
 
 def _helped(before: Array, after: Array) -> bool:
