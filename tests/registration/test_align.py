@@ -423,6 +423,8 @@ def test_the_aligned_picture_lies_on_the_fixed_one():
     inside = warp(of.moving, SIZE, found.fixed_from_moving).valid
     assert np.corrcoef(drawn[inside], of.fixed[inside])[0, 1] > 0.95
     assert not drawn[~inside].any()
+    with pytest.raises(ValueError, match="moving is "):
+        warp_onto_fixed(of.moving[1:], found)
 
 
 # The same bits

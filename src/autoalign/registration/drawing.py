@@ -77,7 +77,10 @@ def warp_onto_fixed(
 ) -> Picture:
     """`moving` (h, w) or (h, w, c) resampled to the size of the fixed picture; `fill` where it has no data.
 
-    For the mask of where it has data, call `warp` itself. Raises AlignmentError if the pair was rejected.
+    For the mask of where it has data, call `warp` itself. Raises AlignmentError if the pair was rejected, ValueError for
+    a picture of another size than the moving one, such as the fixed one, on which the transform says nothing.
     """
     fixed_from_moving = alignment.fixed_from_moving
+    if size_of(moving) != alignment.moving_size:
+        raise ValueError(f"moving is {size_of(moving)}, the picture that was aligned {alignment.moving_size}")
     return warp(moving, alignment.fixed_size, fixed_from_moving, interpolation=interpolation, fill=fill).pixels
