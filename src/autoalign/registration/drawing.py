@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from autoalign.geometry.homography import Array, translation
 from autoalign.picture.border import Border, bordered
 from autoalign.picture.canvas import Canvas, CanvasKind, canvas
-from autoalign.picture.pixels import Picture, PixelSource, size_of
+from autoalign.picture.pixels import Picture, PixelSource, check_picture, size_of
 from autoalign.picture.warp import Interpolation, Warped, warp
 from autoalign.registration.alignment import Alignment
 
@@ -77,10 +77,11 @@ def warp_onto_fixed(
 ) -> Picture:
     """`moving` (h, w) or (h, w, c) resampled to the size of the fixed picture; `fill` where it has no data.
 
-    For the mask of where it has data, call `warp` itself. Raises AlignmentError if the pair was rejected, ValueError for
-    a picture of another size than the moving one, such as the fixed one, on which the transform says nothing.
+    For the mask of where it has data, call `warp` itself. Raises AlignmentError if the pair was rejected, and
+    ValueError for what is no picture, or one of another size than the moving one, such as the fixed one.
     """
     fixed_from_moving = alignment.fixed_from_moving
+    check_picture(moving, "moving")
     if size_of(moving) != alignment.moving_size:
         raise ValueError(f"moving is {size_of(moving)}, the picture that was aligned {alignment.moving_size}")
     return warp(moving, alignment.fixed_size, fixed_from_moving, interpolation=interpolation, fill=fill).pixels
