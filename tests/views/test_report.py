@@ -114,6 +114,12 @@ def test_a_pair_that_failed_has_no_numbers(tmp_path: Path) -> None:
     assert row["links"] == {}
 
 
+def test_a_frame_of_a_sequence_has_no_matches_of_its_own(tmp_path: Path) -> None:
+    (row,) = page(tmp_path, (replace(ALIGNED, rung=None, matches=0, inliers=0, overlap=0.0), None)).rows
+    assert {row[name] for name in ("matches", "inliers", "overlap")} == {None}
+    assert row["expected_error_px"] == ALIGNED.expected_error_px
+
+
 def test_a_picture_that_rows_share_stands_once(tmp_path: Path) -> None:
     pairs = [(replace(ALIGNED, name=f"{k}.jpg"), shown(k)) for k in range(5)]
     found = page(tmp_path, *pairs)

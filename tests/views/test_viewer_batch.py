@@ -17,6 +17,7 @@ from autoalign.views import viewer_batch
 from autoalign.views.evidence import STATUS_COLOUR
 from autoalign.views.viewer_batch import write_batch_recording
 from autoalign.views.window import viewer_program
+from rows import ALIGNED
 
 STATUSES: tuple[RowStatus, ...] = ("aligned", "aligned", "rejected", "failed", "doubtful", "aligned")
 ERRORS_PX = (0.25, 0.5, None, None, 2.5, 0.125)
@@ -37,6 +38,7 @@ def rows() -> list[tuple[Row, Thumbnails | None]]:
                 expected_error_px=error,
                 inliers=inliers,
                 matches=500,
+                rung="sift",
             ),
             None if status == "failed" else pictures(k, status != "rejected"),
         )
@@ -79,6 +81,14 @@ def test_every_pair_has_its_place_on_the_time_bar(recording: Recording) -> None:
     assert [f"Reason {k}." in str(text[0]) for k, text in enumerate(texts.values())] == [True] * 6
     assert "expected error | 0.25 px" in str(texts[1][0])
     assert "matches" not in str(texts[4][0])
+
+
+def test_a_frame_of_a_sequence_has_no_matches_of_its_own(tmp_path: Path) -> None:
+    recording = recorded(tmp_path, [(replace(ALIGNED, rung=None), None)])
+    (text,) = over_time(recording, "/pair", "TextDocument:text").values()
+    assert "expected error | " in str(text[0])
+    assert "matches | " not in str(text[0])
+    assert not over_time(recording, "/inliers/aligned", "Scalars:scalars")
 
 
 def test_numbers_stand_with_their_status(recording: Recording) -> None:

@@ -37,6 +37,11 @@ class Row:
     sidecar: str | None = None
     recording: str | None = None
 
+    @property
+    def is_matched(self) -> bool:
+        """Whether it has matches of its own: a pair that failed has none, and a frame rests on links instead."""
+        return self.rung is not None and self.status != "failed"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Thumbnails:

@@ -28,7 +28,7 @@ from autoalign.views.tally import Tally
 from autoalign.views.words import MARK_OF, counted, moved, number, plain
 
 _ROWS = "<!-- rows -->"  # where they stand in the template
-_FOUND = ("matches", "inliers", "overlap")  # fields of a row, of which a failed pair knows none
+_FOUND = ("matches", "inliers", "overlap")  # fields of a row that has matches of its own
 _LINKS = ("output", "sidecar", "recording")  # fields of a row: files relative to the folder of the report
 
 
@@ -102,7 +102,7 @@ def _record(row: Row, moves: Motion | None, pictures: list[int | None] | None) -
         "advice": plain(row.advice),
         "expected_error_px": _finite(row.expected_error_px),
         **dict.fromkeys(_FOUND),
-        **({} if row.status == "failed" else {name: _finite(getattr(row, name)) for name in _FOUND}),
+        **({name: _finite(getattr(row, name)) for name in _FOUND} if row.is_matched else {}),
         "shift_px": None if moves is None else math.hypot(*moves.shift_px),
         "motion": None if moves is None else moved(moves),
         "model": row.model,

@@ -112,7 +112,7 @@ def _send_rows(recording: rr.RecordingStream, numbers: Sequence[int], rows: Sequ
         errors = [row.expected_error_px if row.status == status else None for row in rows]
         _send_numbers(recording, f"expected_error/{status}", numbers, errors)
     for status in _WITH_MATCHES:
-        inliers = [row.inliers if row.status == status else None for row in rows]
+        inliers = [row.inliers if row.status == status and row.is_matched else None for row in rows]
         _send_numbers(recording, f"inliers/{status}", numbers, inliers)
 
 
@@ -157,7 +157,7 @@ def _told(row: Row) -> str:
 def _facts(row: Row) -> Iterator[tuple[str, str]]:
     if row.expected_error_px is not None:
         yield "expected error", f"{number(row.expected_error_px)} px"
-    if row.status != "failed":
+    if row.is_matched:
         yield "matches", f"{row.inliers:,} of {row.matches:,} agree"
         yield "overlap", f"{row.overlap:.0%} of fixed"
     for name in ("fixed", "moving", "output", "sidecar", "recording"):
