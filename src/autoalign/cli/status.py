@@ -79,10 +79,8 @@ def _tell_state(ledger: LedgerReader, worst: int) -> None:
     counts = ledger.counts()
     pending = counts["pending"]
     done = sum(counts.values()) - pending
-    tell(
-        f"{counted(done + pending, 'pair')}: {tally(counts) or 'nothing done'}"
-        + (f", {pending:,} to do" if pending else "")
-    )
+    to_do = f", {pending:,} to do" if pending else ""
+    tell(f"{counted(done + pending, 'pair')}: {tally(counts) or 'nothing done'}{to_do}")
     runs = ledger.runs()
     if runs and runs[-1].ended is None and pending:
         span = min(RECENT_S, max(time.time() - runs[-1].started, 1.0))
