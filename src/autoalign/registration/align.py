@@ -24,7 +24,7 @@ from autoalign.registration.ladder import Rung, rungs
 from autoalign.registration.matching import Matches, match
 from autoalign.registration.prepared import Pair, Prepared, prepare
 from autoalign.registration.refine import refine
-from autoalign.registration.verdict import chance, hints, judge, nothing_found, set_aside, weigh
+from autoalign.registration.verdict import SPOT_SIGMAS, chance, hints, judge, nothing_found, set_aside, weigh
 
 
 def align(
@@ -171,6 +171,7 @@ def _as_pairs(fixed: Features, moving: Features, matches: Matches) -> Correspond
         dst=fixed.points[matches.fixed_index],
         src_sigma=moving.sigmas[matches.moving_index],
         dst_sigma=fixed.sigmas[matches.fixed_index],
+        support_px=SPOT_SIGMAS * float(fixed.sigmas[matches.fixed_index].mean()) if len(matches) else 0.0,
     )
 
 

@@ -30,11 +30,12 @@ from autoalign.geometry.homography import (
 )
 from autoalign.geometry.least_squares import Correspondences, polish
 from autoalign.geometry.ransac import Consensus
-from autoalign.geometry.uncertainty import overlap_share
+from autoalign.geometry.uncertainty import overlap_points, overlap_share, point_errors, uncertainty
 from autoalign.picture.pixels import Picture, Shrunken, halve, size_of, to_8_bit
 from autoalign.registration.patches import RIM, Comparison, Manner, compare_as
 
 _COMMON_BIAS = 0.25  # sigmas that all keypoints may be off together: ORB's corners are whole pixels
+_DOUBT = 2.0  # times the error that a consensus expects of itself, it may have
 _FEW = 300  # patches; where there is no room for so many side by side, they may overlap more
 _SCOUTS = 400  # patches that lead the way, at least
 _CORNER_PIXELS = 1e6  # corners are looked for in a picture that is halved to at most so many
@@ -119,8 +120,6 @@ def follow(
     """
     unchanged, model = _unchanged(consensus, matched), MODELS[consensus.model]
     led = _led(looks, count, consensus, options)
-    if led is None:
-        return unchanged
     finest, everyone = looks[-1], np.arange(count)
     judges = everyone % _HELD_OUT == 0
     seen = finest(led, everyone, "both ways")
@@ -137,16 +136,15 @@ def follow(
     return Refinement(fixed_from_moving=transform, pairs=seen.pairs[kept], patches=patches, sharpened=True)
 
 
-def _led(looks: Sequence[Look], count: int, consensus: Consensus, options: RefineOptions) -> Array | None:
-    """Where a few hundred patches lead, so that the others need not go the way; None where they are too few."""
+def _led(looks: Sequence[Look], count: int, consensus: Consensus, options: RefineOptions) -> Array:
+    """Where a few hundred patches lead, so that the others need not go the way."""
     transform = consensus.dst_from_src
     scouts = np.flatnonzero(np.arange(count) % _HELD_OUT)[:: max(1, count // _SCOUTS)]
     for look in [looks[0], *looks]:
         seen = look(transform, scouts, "rough")
         moved = _fit(MODELS[consensus.model], transform, seen, _usable(seen, options), _LEADING_STEPS)
-        if moved is None:
-            return None
-        transform = moved
+        if moved is not None:  # of a small picture halved, too few patches are left
+            transform = moved
     return transform
 
 
@@ -183,10 +181,17 @@ def _look_at(level: _Level, places: Array, radius: int) -> Look:
 def _levels(
     fixed: Picture, moving: Picture, transform: Array, consensus: Consensus, matched: Correspondences
 ) -> list[_Level]:
-    """From the level at which the consensus is good to about a pixel to the finest, by halves."""
-    centre = matched.src[consensus.inliers].mean(0, keepdims=True)
+    """From the level at which the consensus is good to about a pixel all over to the finest, by halves."""
+    pairs, model = matched[consensus.inliers], MODELS[consensus.model]
+    centre = pairs.src.mean(0, keepdims=True)
     zoom = float(np.log2(abs(np.linalg.det(jacobian(transform, centre)[0]))) / 2)  # halvings from moving to fixed px
-    doubt_px = float(np.median(matched.dst_sigma[consensus.inliers])) / max(1.0, 2**zoom)
+    far = point_errors(
+        model,
+        transform,
+        uncertainty(model, transform, pairs),
+        overlap_points(transform, size_of(moving), size_of(fixed)),
+    )
+    doubt_px = max(float(np.median(pairs.dst_sigma)), _DOUBT * float(far.max(initial=0.0))) / max(1.0, 2**zoom)
     coarser = int(np.clip(np.round(np.log2(max(doubt_px, 1.0))), 0, 4))
     fixed_levels = pyramid(fixed, max(0, round(zoom)), coarser)
     moving_levels = pyramid(moving, max(0, round(-zoom)), coarser)

@@ -23,7 +23,7 @@ from autoalign.registration.agreement import Agreement
 
 Status = Literal["aligned", "doubtful", "rejected"]
 
-_SPOT_SIGMAS = 5.0  # matches nearer than this are one observation
+SPOT_SIGMAS = 5.0  # matches nearer than this are one observation
 
 
 # What the defaults below rest on (scripts/calibrate.py, 77 true pairs, 100 made-up captions, 8 traps, 2,000 unrelated):
@@ -147,8 +147,8 @@ def _root_mean_square(values: Array) -> float:
 
 def _independent(pairs: Correspondences) -> NDArray[np.int64]:
     """Indices of the matches that repeat no better one's spot, in either picture."""
-    by_dst = first_in_each_cell(pairs.dst / pairs.dst_sigma.mean(), _SPOT_SIGMAS)
-    return np.asarray(by_dst[first_in_each_cell(pairs.src[by_dst] / pairs.src_sigma.mean(), _SPOT_SIGMAS)])
+    by_dst = first_in_each_cell(pairs.dst / pairs.dst_sigma.mean(), SPOT_SIGMAS)
+    return np.asarray(by_dst[first_in_each_cell(pairs.src[by_dst] / pairs.src_sigma.mean(), SPOT_SIGMAS)])
 
 
 def _chances(transform: Array, pairs: Correspondences, src_size: tuple[int, int], dst_size: tuple[int, int]) -> Array:
