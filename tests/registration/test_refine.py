@@ -325,7 +325,7 @@ def test_options_out_of_range_are_refused(wrong):
 
 @pytest.mark.parametrize("name", ["astronaut.png", "moon.png", "cell.png"])
 def test_a_consensus_that_is_good_in_one_corner_only_is_led_to_the_truth_everywhere(name):
-    """Far from its keypoints it is off by several pixels, which is where to begin, and faint structure cannot follow."""
+    """Far from its keypoints it is off by several pixels, which is where to begin: faint structure cannot follow."""
     of = pair(name, TRUTH, (480, 400), noise=4.0)
     everywhere = keypoints(of, 1.0, count=150)
     matched = everywhere[(everywhere.src < np.array(of.moving.shape[1::-1]) * 0.4).all(1)]
