@@ -22,6 +22,7 @@ from autoalign.registration.verdict import (
     hints,
     judge,
     nothing_found,
+    nothing_shown,
     set_aside,
     weigh,
 )
@@ -136,6 +137,15 @@ def test_the_expected_error_grows_with_each_of_its_parts():
         small, large = (expected_error(replace(EVIDENCE, **{part: px})) for px in (1.0, 2.0))
         assert expected_error(EVIDENCE) < small < large
     assert np.isfinite(expected_error(replace(EVIDENCE, halves_px=float("inf"))))  # too few to halve: the fit says it
+
+
+@pytest.mark.parametrize(
+    ("counts", "said"), [((0, 900), "fixed picture has 0 keypoints"), ((900, 1), "moving picture has 1 keypoint to")]
+)
+def test_a_picture_that_shows_nothing_is_named(counts, said):
+    verdict = nothing_shown(*counts)
+    assert verdict.status == "rejected"
+    assert said in verdict.reason
 
 
 def test_what_was_set_aside_says_what_it_found():

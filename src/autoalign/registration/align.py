@@ -24,7 +24,19 @@ from autoalign.registration.ladder import Rung, rungs
 from autoalign.registration.matching import Matches, match
 from autoalign.registration.prepared import Pair, Prepared, prepare
 from autoalign.registration.refine import refine
-from autoalign.registration.verdict import SPOT_SIGMAS, chance, hints, judge, nothing_found, set_aside, weigh
+from autoalign.registration.verdict import (
+    SPOT_SIGMAS,
+    Verdict,
+    chance,
+    hints,
+    judge,
+    nothing_found,
+    nothing_shown,
+    set_aside,
+    weigh,
+)
+
+_TOO_FEW = 5  # keypoints, of which no transform can be checked
 
 
 def align(
@@ -113,7 +125,7 @@ def _attempt(pair: Pair, rung: Rung, options: AlignOptions) -> Attempt:
         moving_features=moving_features,
         matches=matches,
         pairs=pairs,
-        verdict=nothing_found(len(pairs)),
+        verdict=_without_consensus(fixed_features, moving_features, pairs),
         seconds=seconds,
     )
     if consensus is None:
@@ -127,6 +139,12 @@ def _attempt(pair: Pair, rung: Rung, options: AlignOptions) -> Attempt:
         fixed_from_moving=consensus.dst_from_src,
         verdict=set_aside(known),
     )
+
+
+def _without_consensus(fixed: Features, moving: Features, pairs: Correspondences) -> Verdict:
+    if min(len(fixed), len(moving)) < _TOO_FEW:
+        return nothing_shown(len(fixed), len(moving))
+    return nothing_found(len(pairs))
 
 
 def _concluded(attempt: Attempt, pair: Pair, options: AlignOptions) -> Attempt:
@@ -180,10 +198,10 @@ def _general(choice: ModelChoice) -> ModelName:
     return "homography" if choice == "auto" else choice
 
 
-def _rank(attempt: Attempt) -> tuple[int, float]:
-    """Better verdicts first, then the consensus that is less probable by chance."""
+def _rank(attempt: Attempt) -> tuple[int, float, int]:
+    """Better verdicts first, then the consensus that is less probable by chance, then more matches."""
     order = {"aligned": 2, "doubtful": 1, "rejected": 0}
-    return order[attempt.verdict.status], -attempt.log10_false_alarms
+    return order[attempt.verdict.status], -attempt.log10_false_alarms, len(attempt.pairs)
 
 
 @contextmanager

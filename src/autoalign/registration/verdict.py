@@ -226,6 +226,17 @@ def nothing_found(matches: int) -> Verdict:
     )
 
 
+def nothing_shown(fixed_keypoints: int, moving_keypoints: int) -> Verdict:
+    """The verdict where a picture shows too little for a transform to be looked for."""
+    count, role = min((fixed_keypoints, "fixed"), (moving_keypoints, "moving"))
+    return Verdict(
+        status="rejected",
+        reason=f"the {role} picture has {count} keypoint{'' if count == 1 else 's'} to find it by",
+        advice="it is flat, tiny, masked or very blurred",
+        expected_error_px=None,
+    )
+
+
 def set_aside(known: Chance) -> Verdict:
     """The verdict on a consensus that was not looked into, because another one says more."""
     return Verdict(
