@@ -10,6 +10,7 @@ from autoalign.picture.pixels import shrink, working_copy
 from autoalign.registration import large as large_module
 from autoalign.registration.alignment import AlignOptions
 from autoalign.registration.large import Large, align_large
+from autoalign.registration.prepared import prepare
 from autoalign.registration.refine import RefineOptions
 
 TRUTH = np.array([[1.02, 0.05, 10.0], [-0.04, 0.98, 7.5], [1e-5, -5e-6, 1.0]])
@@ -20,8 +21,13 @@ def views():
     return pair("astronaut.png", TRUTH, (500, 420))
 
 
-def seen(pixels, max_pixels=30_000):
-    return Large(pixels=pixels, copy=working_copy(pixels, max_pixels))
+def seen(pixels, max_pixels=30_000, valid=None, source=None):
+    copy = working_copy(pixels, max_pixels)
+    return Large(
+        pixels=pixels if source is None else source,
+        copy=prepare(copy.pixels, valid),
+        full_from_copy=copy.full_from_small,
+    )
 
 
 class Boxes:
@@ -46,7 +52,7 @@ def test_the_full_pictures_sharpen_what_the_copies_gave(views):
     copies = align_large(
         seen(views.fixed), seen(views.moving), AlignOptions(refine=RefineOptions(patches=0), model="homography")
     )
-    fixed, moving = (Large(pixels=Boxes(of), copy=working_copy(of, 30_000)) for of in (views.fixed, views.moving))
+    fixed, moving = (seen(of, source=Boxes(of)) for of in (views.fixed, views.moving))
     found = align_large(fixed, moving, AlignOptions(model="homography"))
     assert found.status == "aligned"
     assert (found.fixed_size, found.moving_size) == ((500, 420), (500, 420))
@@ -73,8 +79,8 @@ def test_float_with_holes_is_sharpened_around_them(views):
 
 
 def test_masks_are_those_of_the_copies(views):
-    blind = np.zeros(seen(views.fixed).copy.pixels.shape[:2], bool)
-    found = align_large(seen(views.fixed), seen(views.moving), fixed_valid=blind)
+    blind = np.zeros(seen(views.fixed).copy.grey.shape, bool)
+    found = align_large(seen(views.fixed, valid=blind), seen(views.moving))
     assert found.status == "rejected"
     assert found.best.fixed_from_moving is None
 

@@ -115,13 +115,12 @@ def align_both(both: Both, options: AlignOptions) -> Alignment:
     fixed, moving = both.seen()
     if not both.is_large:
         return align(fixed.prepared, moving.prepared, options)
-    return align_large(
-        Large(pixels=both.fixed.picture.pixels, copy=fixed.copy),
-        Large(pixels=both.moving.picture.pixels, copy=moving.copy),
-        options,
-        fixed_valid=fixed.prepared.usable,
-        moving_valid=moving.prepared.usable,
-    )
+    fixed_picture, moving_picture = both.pictures
+    return align_large(_large(fixed_picture, fixed), _large(moving_picture, moving), options)
+
+
+def _large(picture: AnyPicture, seen: Seen) -> Large:
+    return Large(pixels=picture.pixels, copy=seen.prepared, full_from_copy=seen.copy.full_from_small)
 
 
 def _look(source: Source, picture: AnyPicture, small: bool) -> Seen:

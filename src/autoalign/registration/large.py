@@ -10,13 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from autoalign.geometry.homography import Array, Mask, invert, jacobian, project, translation
+from autoalign.geometry.homography import Array, invert, jacobian, project, translation
 from autoalign.geometry.least_squares import Correspondences
 from autoalign.picture.pixels import PixelSource, Shrunken, grey, opaque, size_of, to_8_bit
 from autoalign.registration.align import align
 from autoalign.registration.alignment import Alignment, AlignOptions, Attempt
 from autoalign.registration.frames import in_pixels_of
 from autoalign.registration.patches import RIM, Comparison, Manner, compare_as, joined
+from autoalign.registration.prepared import Prepared
 from autoalign.registration.refine import Look, follow, in_grey_levels, pyramid
 from autoalign.registration.verdict import Sizes, judge, weigh
 
@@ -28,30 +29,24 @@ _SLACK = 4  # px around a patch for what the transform is still off
 
 @dataclass(frozen=True, kw_only=True)
 class Large:
-    """A picture that is read box by box, and a copy of it that fits into memory."""
+    """A picture that is read box by box, and a copy of it that fits into memory, ready to be aligned."""
 
     pixels: PixelSource
-    copy: Shrunken
+    copy: Prepared
+    full_from_copy: Array  # (3, 3)
 
 
-def align_large(
-    fixed: Large,
-    moving: Large,
-    options: AlignOptions | None = None,
-    *,
-    fixed_valid: Mask | None = None,
-    moving_valid: Mask | None = None,
-) -> Alignment:
-    """As `align`, for pictures of which only patches are read at their full size; the masks are those of the copies.
+def align_large(fixed: Large, moving: Large, options: AlignOptions | None = None) -> Alignment:
+    """As `align`, for pictures of which only patches are read at their full size.
 
     The alignment is told in pixels of the full pictures, and its expected error is that of patches compared there.
     Where these did not prove better, it is that of the copies, as many times larger as they are smaller. What reading
     raises goes through.
     """
     options = options or AlignOptions()
-    small = align(fixed.copy.pixels, moving.copy.pixels, options, fixed_valid=fixed_valid, moving_valid=moving_valid)
+    small = align(fixed.copy, moving.copy, options)
     sizes = Sizes(fixed=size_of(fixed.pixels), moving=size_of(moving.pixels))
-    told = {id(of): in_pixels_of(of, fixed.copy.full_from_small, moving.copy.full_from_small) for of in small.attempts}
+    told = {id(of): in_pixels_of(of, fixed.full_from_copy, moving.full_from_copy) for of in small.attempts}
     if small.status != "rejected":
         started = perf_counter()
         best = _sharpened(told[id(small.best)], fixed.pixels, moving.pixels, options)
