@@ -25,7 +25,7 @@ from autoalign.geometry.family import MODELS, fit
 from autoalign.geometry.homography import apply, project
 from autoalign.geometry.least_squares import correspondences, polish
 from autoalign.registration.align import align
-from autoalign.registration.alignment import AlignOptions
+from autoalign.registration.alignment import Alignment, AlignOptions
 
 
 def related(root: Path) -> list[dict[str, Any]]:
@@ -109,12 +109,27 @@ def true_error(job: dict[str, Any], fixed_from_moving: np.ndarray, moving: np.nd
     if job["landmarks"]:
         marks = np.loadtxt(job["landmarks"], delimiter=",", skiprows=1)[:, :4]
         return float(np.sqrt(((apply(fixed_from_moving, marks[:, :2]) - marks[:, 2:]) ** 2).sum(1).mean()))
-    truth = np.loadtxt(job["truth"]).reshape(3, 3)
+    grid, truth = in_overlap(job, moving, fixed), np.loadtxt(job["truth"]).reshape(3, 3)
+    return float(np.linalg.norm(project(fixed_from_moving, grid)[0] - project(truth, grid)[0], axis=1).mean())
+
+
+def in_overlap(job: dict[str, Any], moving: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """(n, 2) points of a grid over moving that truly land in fixed."""
     (h, w), (h2, w2) = moving.shape[:2], fixed.shape[:2]
     grid = np.stack(np.meshgrid(np.linspace(0, w - 1, 48), np.linspace(0, h - 1, 48)), -1).reshape(-1, 2)
-    there = project(truth, grid)[0]
-    inside = ((there >= 0) & (there <= (w2 - 1, h2 - 1))).all(1)
-    return float(np.linalg.norm(project(fixed_from_moving, grid)[0] - there, axis=1)[inside].mean())
+    there = project(np.loadtxt(job["truth"]).reshape(3, 3), grid)[0]
+    return grid[((there >= 0) & (there <= (w2 - 1, h2 - 1))).all(1)]
+
+
+def loop_error(
+    fixed_from_moving: np.ndarray, back: Alignment, job: dict[str, Any], moving: np.ndarray, fixed: np.ndarray
+) -> float:
+    """Mean distance over the true overlap by which a point that goes there and back misses itself, px of moving."""
+    if back.best.fixed_from_moving is None:
+        return float("inf")
+    grid = in_overlap(job, moving, fixed)
+    there_and_back = project(back.best.fixed_from_moving, project(fixed_from_moving, grid)[0])[0]
+    return float(np.linalg.norm(there_and_back - grid, axis=1).mean())
 
 
 def landmark_noise(job: dict[str, Any]) -> float:
@@ -156,6 +171,8 @@ def run(job: dict[str, Any], effort: str) -> dict[str, Any]:
         found = alignment.best.fixed_from_moving
         row["error"] = float("inf") if found is None else true_error(job, found, moving, fixed)
         row["truth_noise"] = landmark_noise(job)
+    if job["name"].startswith("exact") and found is not None:
+        row["loop"] = loop_error(found, align(moving, fixed, alignment.options), job, moving, fixed)
     return row
 
 
@@ -201,6 +218,11 @@ def calibration(rows: list[dict[str, Any]]) -> None:
         print(
             f"true over expected error, {name}: {len(group)} pairs, median {np.median(ratio):.2f}, "
             f"within twice {np.mean(ratio <= 2):.1%}, largest {ratio.max():.1f}"
+        )
+    loops = [r["loop"] for r in rows if "loop" in r]
+    if loops:
+        print(
+            f"there and back, exact: {len(loops)} pairs, median {np.median(loops):.4f} px, largest {max(loops):.4f} px"
         )
 
 

@@ -28,8 +28,8 @@ SPOT_SIGMAS = 5.0  # matches nearer than this are one observation
 
 # What the defaults below rest on (scripts/calibrate.py, 77 true pairs, 100 made-up captions, 8 traps, 2,000 unrelated):
 #                                   true pairs, aligned or doubtful   false pairs
-#   log10 of false alarms           -59 and below                     -2.0 and above; captions are like true ones
-#   share of the overlap agreeing   0.27 and above, aligned 0.50      0.17 and below
+#   log10 of false alarms           -62 and below                     -2.0 and above; captions are like true ones
+#   share of the overlap agreeing   0.26 and above, aligned 0.52      0.16 and below
 # Thresholds found without a scene decide that scene rightly, for every scene.
 @dataclass(frozen=True, kw_only=True)
 class VerdictOptions:
