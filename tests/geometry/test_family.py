@@ -201,3 +201,8 @@ def test_four_corners_typed_in_another_order_are_refused_with_that_reason():
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     with pytest.raises(ValueError, match="another order"):
         fit("homography", corners, corners[[0, 2, 1, 3]])
+
+
+def test_a_model_that_there_is_not_is_named():
+    with pytest.raises(ValueError, match=r"'afine' is none of the models identity, .*, homography"):
+        fit("afine", np.zeros((3, 2)), np.zeros((3, 2)))

@@ -113,6 +113,11 @@ def test_shown_refuses_a_transform_without_such_a_form():
         shown(HORIZON_IN_ORIGIN)
 
 
+def test_only_a_transform_of_three_by_three_is_applied():
+    with pytest.raises(ValueError, match=r"\(3, 3\), not \(2, 2\)"):
+        apply(np.eye(2), [[1.0, 2.0]])
+
+
 @pytest.mark.parametrize("bad", [[1.0, 2.0], [[1.0, 2.0, 3.0]], [[np.nan, 0.0]], [[np.inf, 0.0]]])
 def test_what_is_no_set_of_points_is_refused(bad):
     with pytest.raises(ValueError, match="here"):

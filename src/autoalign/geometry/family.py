@@ -176,9 +176,12 @@ def _spread(points: Array, min_area: float) -> Mask:
 def fit(model: ModelName, src: ArrayLike, dst: ArrayLike, weights: ArrayLike | None = None) -> Array:
     """The model that takes (n, 2) src to (n, 2) dst with the least weighted squared error: (3, 3) of unit norm.
 
-    For a homography the error is the algebraic one of the DLT. Raises ValueError where the points do not fix the model.
+    For a homography the error is the algebraic one of the DLT. Raises ValueError where the points do not fix the model,
+    and for a model that there is not.
     """
     src, dst = as_points(src, "src"), as_points(dst, "dst")
+    if model not in MODELS:
+        raise ValueError(f"{model!r} is none of the models {', '.join(MODEL_NAMES)}")
     member = MODELS[model]
     if len(src) != len(dst) or len(src) < member.sample_size:
         raise ValueError(f"{model} needs {member.sample_size} or more pairs of points, not {len(src)} and {len(dst)}")

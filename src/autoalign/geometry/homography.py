@@ -108,7 +108,10 @@ def apply(transform: Array, points: ArrayLike) -> Array:
 
     Raises ValueError for a wrong shape or a point that is not finite.
     """
-    return project(np.asarray(transform, np.float64), as_points(points))[0]
+    transform = np.asarray(transform, np.float64)
+    if transform.shape != (3, 3):
+        raise ValueError(f"a transform is (3, 3), not {transform.shape}")
+    return project(transform, as_points(points))[0]
 
 
 def jacobian(transform: Array, points: Array) -> Array:
