@@ -171,8 +171,8 @@ def run(job: dict[str, Any], effort: str) -> dict[str, Any]:
         found = alignment.best.fixed_from_moving
         row["error"] = float("inf") if found is None else true_error(job, found, moving, fixed)
         row["truth_noise"] = landmark_noise(job)
-    if job["name"].startswith("exact") and found is not None:
-        row["loop"] = loop_error(found, align(moving, fixed, alignment.options), job, moving, fixed)
+        if found is not None and job["name"].startswith("exact"):
+            row["loop"] = loop_error(found, align(moving, fixed, alignment.options), job, moving, fixed)
     return row
 
 
