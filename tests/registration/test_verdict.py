@@ -22,7 +22,6 @@ from autoalign.registration.verdict import (
     hints,
     judge,
     nothing_found,
-    nothing_shown,
     set_aside,
     weigh,
 )
@@ -143,7 +142,7 @@ def test_the_expected_error_grows_with_each_of_its_parts():
     ("counts", "said"), [((0, 900), "fixed picture has 0 keypoints"), ((900, 1), "moving picture has 1 keypoint to")]
 )
 def test_a_picture_that_shows_nothing_is_named(counts, said):
-    verdict = nothing_shown(*counts)
+    verdict = nothing_found(*counts, 7)
     assert verdict.status == "rejected"
     assert said in verdict.reason
 
@@ -157,7 +156,7 @@ def test_what_was_set_aside_says_what_it_found():
 
 
 def test_nothing_found_says_how_many_matches_there_were():
-    verdict = nothing_found(7)
+    verdict = nothing_found(900, 900, 7)
     assert verdict.status == "rejected"
     assert numbers(verdict.reason) == {"7"}
     assert verdict.advice

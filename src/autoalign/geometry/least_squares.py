@@ -17,22 +17,23 @@ import numpy as np
 from autoalign.geometry.family import Model
 from autoalign.geometry.homography import Array, invert, normalisation, project, project_and_slope, unit
 
-_SAMPLED = 200  # pairs that are enough to see how far supports overlap
 TUKEY = 4.685  # 95 % efficiency at a normal distribution
+_SAMPLED = 200  # pairs that are enough to see how far supports overlap
 _CONVERGED = 1e-7  # step, in coordinates where the points are about 1 from their mean: 1e-4 px of any picture
 
 
 @dataclass(frozen=True, kw_only=True)
 class Correspondences:
-    """Pairs of points, and how far each may be off."""
+    """Pairs of points, and how far each may be off.
+
+    Pairs share noise where the squares of dst that they were measured on, their supports, overlap.
+    """
 
     src: Array  # (n, 2)
     dst: Array  # (n, 2)
     src_sigma: Array  # (n,) expected error of a point, px of its picture
     dst_sigma: Array  # (n,)
-    support_px: float = (
-        0.0  # side of the square of dst that each was measured on: where these overlap, so does the noise
-    )
+    support_px: float = 0.0  # side of a support, dst px
 
     def __len__(self) -> int:
         return len(self.src)

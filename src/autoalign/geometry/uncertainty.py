@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autoalign.geometry.family import Model
-from autoalign.geometry.homography import Array, invert, jacobian, normalisation, project
+from autoalign.geometry.homography import Array, invert, jacobian, normalisation, project, project_and_slope
 from autoalign.geometry.least_squares import Correspondences, tukey_weights, velocities
 
 _MEAN_OF_LENGTH = 0.886  # mean length of a 2-D normal error over its root-mean-square length: sqrt(pi) / 2
@@ -38,12 +38,12 @@ def uncertainty(model: Model, dst_from_src: Array, pairs: Correspondences) -> Un
     the noise of both pictures.
     """
     norm = normalisation(pairs.src)
-    projected, _ = project(dst_from_src, pairs.src)
-    residuals = pairs.dst - projected
+    projected, by_place = project_and_slope(dst_from_src, pairs.src)
+    residuals = pairs.dst - projected.T
     squared = (residuals**2).sum(1)
     sigma = max(float(np.sqrt(np.median(squared))) / 1.1774, 1e-6)
     weights = tukey_weights(squared, sigma)
-    slope = np.einsum("nij,njg->nig", jacobian(dst_from_src, pairs.src), velocities(model, pairs.src, norm))
+    slope = np.einsum("ijn,njg->nig", by_place, velocities(model, pairs.src, norm))
     normal = np.einsum("nig,nih->gh", slope * weights[:, None, None], slope)
     freedom = max(2.0 * weights.sum() - model.degrees_of_freedom, 1.0)
     variance = float((weights * squared).sum() / freedom) / _VARIANCE_LEFT

@@ -26,17 +26,13 @@ from autoalign.registration.prepared import Pair, Prepared, prepare
 from autoalign.registration.refine import refine
 from autoalign.registration.verdict import (
     SPOT_SIGMAS,
-    Verdict,
     chance,
     hints,
     judge,
     nothing_found,
-    nothing_shown,
     set_aside,
     weigh,
 )
-
-_TOO_FEW = 5  # keypoints, of which no transform can be checked
 
 
 def align(
@@ -125,7 +121,7 @@ def _attempt(pair: Pair, rung: Rung, options: AlignOptions) -> Attempt:
         moving_features=moving_features,
         matches=matches,
         pairs=pairs,
-        verdict=_without_consensus(fixed_features, moving_features, pairs),
+        verdict=nothing_found(len(fixed_features), len(moving_features), len(pairs)),
         seconds=seconds,
     )
     if consensus is None:
@@ -139,12 +135,6 @@ def _attempt(pair: Pair, rung: Rung, options: AlignOptions) -> Attempt:
         fixed_from_moving=consensus.dst_from_src,
         verdict=set_aside(known),
     )
-
-
-def _without_consensus(fixed: Features, moving: Features, pairs: Correspondences) -> Verdict:
-    if min(len(fixed), len(moving)) < _TOO_FEW:
-        return nothing_shown(len(fixed), len(moving))
-    return nothing_found(len(pairs))
 
 
 def _concluded(attempt: Attempt, pair: Pair, options: AlignOptions) -> Attempt:

@@ -59,9 +59,7 @@ def joined(parts: Sequence[Comparison]) -> Comparison:
     )
 
 
-def compare_both_ways(
-    fixed: Shrunken, moving: Shrunken, fixed_from_moving: Array, places: Array, radius: int
-) -> Comparison:
+def _both_ways(fixed: Shrunken, moving: Shrunken, fixed_from_moving: Array, places: Array, radius: int) -> Comparison:
     """As `compare`, cubic: each patch is laid on the fixed picture's pixels, then on the moving one's, and the mean of
     both is taken. What interpolation does to either picture is lost in it, and the answer is that of swapped roles."""
     moving_from_fixed = invert(fixed_from_moving)
@@ -93,7 +91,7 @@ def compare_as(
 ) -> Comparison:
     """Compare in one of the manners."""
     if manner == "both ways":
-        return compare_both_ways(fixed, moving, fixed_from_moving, places, radius)
+        return _both_ways(fixed, moving, fixed_from_moving, places, radius)
     return compare(fixed, moving, fixed_from_moving, places, radius, cubic=manner == "fine")
 
 

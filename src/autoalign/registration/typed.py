@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from numpy.typing import ArrayLike
 
 from autoalign.geometry.family import MODELS, fit
 from autoalign.geometry.homography import Array, as_points
 from autoalign.geometry.least_squares import correspondences, polish
 from autoalign.registration.alignment import Alignment, AlignOptions, Attempt
-from autoalign.registration.verdict import Sizes, judge_typed, nothing_found, unfit_points
+from autoalign.registration.verdict import Sizes, judge_typed, unfit_points
+
+_RUNG = "typed points"
 
 
 def align_points(
@@ -38,10 +38,9 @@ def _typed(fixed_points: Array, moving_points: Array, sizes: Sizes, options: Ali
     pairs = correspondences(src=moving_points, dst=fixed_points)
     enough = [name for name, model in MODELS.items() if 0 < model.sample_size <= len(pairs)]
     model = options.model if options.model != "auto" else (enough or ["translation"])[-1]
-    attempt = Attempt(rung="typed points", verdict=nothing_found(len(pairs)), pairs=pairs)
     try:
         transform = polish(MODELS[model], fit(model, pairs.src, pairs.dst), pairs, sigma_floor=1.0)
     except ValueError as unfit:
-        return replace(attempt, verdict=unfit_points(str(unfit)))
+        return Attempt(rung=_RUNG, pairs=pairs, verdict=unfit_points(str(unfit)))
     verdict = judge_typed(model, transform, pairs, options.verdict, sizes)
-    return replace(attempt, model=model, fixed_from_moving=transform, verdict=verdict)
+    return Attempt(rung=_RUNG, pairs=pairs, model=model, fixed_from_moving=transform, verdict=verdict)

@@ -214,26 +214,24 @@ _MODEL_FACTOR = 2.0  # true over seen error of scenes that are no plane (scripts
 _BIAS = 0.15  # share of the scatter that no number of pairs averages out, on views with other gradation, blur and noise
 _HINT = -1.0  # true pairs that a harder attempt saved had -3.4 and less
 _ALL_THERE_IS = -150.0  # and those had -86 and more
+_TOO_FEW = 5  # keypoints, of which no transform can be checked
 
 
-def nothing_found(matches: int) -> Verdict:
-    """The verdict where no transform was found."""
-    return Verdict(
-        status="rejected",
-        reason=f"{matches} matches, and no transform that more than a handful of them agree on",
-        advice="the pictures may show different things, or too little structure",
-        expected_error_px=None,
-    )
+def _rejected(reason: str, advice: str) -> Verdict:
+    return Verdict(status="rejected", reason=reason, advice=advice, expected_error_px=None)
 
 
-def nothing_shown(fixed_keypoints: int, moving_keypoints: int) -> Verdict:
-    """The verdict where a picture shows too little for a transform to be looked for."""
+def nothing_found(fixed_keypoints: int, moving_keypoints: int, matches: int) -> Verdict:
+    """The verdict where no transform was found: for want of keypoints in one of the pictures, or of matches."""
     count, role = min((fixed_keypoints, "fixed"), (moving_keypoints, "moving"))
-    return Verdict(
-        status="rejected",
-        reason=f"the {role} picture has {count} keypoint{'' if count == 1 else 's'} to find it by",
-        advice="it is flat, tiny, masked or very blurred",
-        expected_error_px=None,
+    if count < _TOO_FEW:
+        return _rejected(
+            f"the {role} picture has {count} keypoint{'' if count == 1 else 's'} to find it by",
+            "it is flat, tiny, masked or very blurred",
+        )
+    return _rejected(
+        f"{matches} matches, and no transform that more than a handful of them agree on",
+        "the pictures may show different things, or too little structure",
     )
 
 
@@ -250,7 +248,7 @@ def set_aside(known: Chance) -> Verdict:
 def judge(evidence: Evidence, options: VerdictOptions, sizes: Sizes) -> Verdict:
     """The verdict on the evidence."""
     for failed, advice in _rejections(evidence, options):
-        return Verdict(status="rejected", reason=failed, advice=advice, expected_error_px=None)
+        return _rejected(failed, advice)
     error = expected_error(evidence)
     for failed, advice in _doubts(evidence, error, options, sizes.fixed):
         return Verdict(status="doubtful", reason=failed, advice=advice, expected_error_px=error)
@@ -342,7 +340,7 @@ def _praise(evidence: Evidence) -> str:
 
 def unfit_points(reason: str) -> Verdict:
     """The verdict on typed points that fix no transform."""
-    return Verdict(status="rejected", reason=reason, advice="type more points, spread", expected_error_px=None)
+    return _rejected(reason, "type more points, spread")
 
 
 def judge_typed(
