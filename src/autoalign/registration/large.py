@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from autoalign.geometry.homography import Array, invert, jacobian, project, translation
+from autoalign.geometry.homography import Array, invert, project, translation
 from autoalign.geometry.least_squares import Correspondences
 from autoalign.picture.pixels import PixelSource, Shrunken, grey, opaque, size_of, to_8_bit
 from autoalign.registration.align import align
@@ -18,7 +18,7 @@ from autoalign.registration.alignment import Alignment, AlignOptions, Attempt
 from autoalign.registration.frames import in_pixels_of
 from autoalign.registration.patches import RIM, Comparison, Manner, compare_as, joined
 from autoalign.registration.prepared import Prepared
-from autoalign.registration.refine import Look, follow, in_grey_levels, pyramid
+from autoalign.registration.refine import Look, follow, in_grey_levels, pyramid, zoom
 from autoalign.registration.verdict import Sizes, judge, weigh
 
 WORKING_PIXELS = 16e6  # of each working copy
@@ -103,11 +103,10 @@ class _Steps:
 
 
 def _steps(fixed: PixelSource, pairs: Correspondences, transform: Array) -> _Steps:
-    centre = pairs.src.mean(0, keepdims=True)
-    zoom = float(np.log2(abs(np.linalg.det(jacobian(transform, centre)[0]))) / 2)  # halvings from moving to fixed px
+    halvings = round(zoom(transform, pairs))
     shrunken = float(np.log2(np.prod(size_of(fixed)) / WORKING_PIXELS)) / 2
     # Copies are aligned to a tenth of their pixels or better: what is left of a px at a quarter of it may be.
-    return _Steps(fixed=max(0, round(zoom)), moving=max(0, round(-zoom)), coarser=int(np.clip(shrunken - 2, 0, 3)) + 1)
+    return _Steps(fixed=max(0, halvings), moving=max(0, -halvings), coarser=int(np.clip(shrunken - 2, 0, 3)) + 1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -103,10 +103,9 @@ def refine(
     """
     if skip or options.patches == 0:
         return _unchanged(consensus, matched)
-    transform = consensus.dst_from_src
     fixed, moving = in_grey_levels(fixed), in_grey_levels(moving)
-    levels = _levels(fixed, moving, transform, consensus, matched)
-    places = _places(levels[-1], transform, options, masks)
+    levels = _levels(fixed, moving, consensus, matched)
+    places = _places(levels[-1], consensus.dst_from_src, options, masks)
     looks = [_look_at(level, places, options.radius) for level in levels]
     return follow(looks, len(places), consensus, matched, options)
 
@@ -178,23 +177,26 @@ def _look_at(level: _Level, places: Array, radius: int) -> Look:
     return look
 
 
-def _levels(
-    fixed: Picture, moving: Picture, transform: Array, consensus: Consensus, matched: Correspondences
-) -> list[_Level]:
-    """From the level at which the consensus is good to about a pixel all over to the finest, by halves."""
-    pairs, model = matched[consensus.inliers], MODELS[consensus.model]
+def zoom(fixed_from_moving: Array, pairs: Correspondences) -> float:
+    """Halvings that bring fixed to the resolution that moving has in the middle of the pairs; of moving if negative."""
     centre = pairs.src.mean(0, keepdims=True)
-    zoom = float(np.log2(abs(np.linalg.det(jacobian(transform, centre)[0]))) / 2)  # halvings from moving to fixed px
+    return float(np.log2(abs(np.linalg.det(jacobian(fixed_from_moving, centre)[0]))) / 2)
+
+
+def _levels(fixed: Picture, moving: Picture, consensus: Consensus, matched: Correspondences) -> list[_Level]:
+    """From the level at which the consensus is good to about a pixel all over to the finest, by halves."""
+    pairs, model, transform = matched[consensus.inliers], MODELS[consensus.model], consensus.dst_from_src
+    halvings = zoom(transform, pairs)
     far = point_errors(
         model,
         transform,
         uncertainty(model, transform, pairs),
         overlap_points(transform, size_of(moving), size_of(fixed)),
     )
-    doubt_px = max(float(np.median(pairs.dst_sigma)), _DOUBT * float(far.max(initial=0.0))) / max(1.0, 2**zoom)
+    doubt_px = max(float(np.median(pairs.dst_sigma)), _DOUBT * float(far.max(initial=0.0))) / max(1.0, 2**halvings)
     coarser = int(np.clip(np.round(np.log2(max(doubt_px, 1.0))), 0, 4))
-    fixed_levels = pyramid(fixed, max(0, round(zoom)), coarser)
-    moving_levels = pyramid(moving, max(0, round(-zoom)), coarser)
+    fixed_levels = pyramid(fixed, max(0, round(halvings)), coarser)
+    moving_levels = pyramid(moving, max(0, round(-halvings)), coarser)
     return [_Level(fixed=f, moving=m) for f, m in zip(fixed_levels, moving_levels, strict=True)]
 
 
